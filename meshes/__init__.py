@@ -1,0 +1,1 @@
+"""Tubes: meshes and centrelines from files, generated curves, and batched geometric queries."""
