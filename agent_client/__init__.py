@@ -1,0 +1,1 @@
+"""The agent: sensors, observation, actions, reward, policies, training, and the inference loop."""
