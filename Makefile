@@ -1,0 +1,44 @@
+# Two commands set everything up: `make launch` (fly) and `make test` (develop). Both are quick the second time.
+PYTHON ?= python3.11
+VENV   := .venv
+BIN    := $(VENV)/bin
+PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+
+.PHONY: launch test check format bench clean
+
+launch: $(VENV)/.fly
+	$(BIN)/cosim launch
+
+test: $(VENV)/.all check
+	$(BIN)/python -m pytest
+
+check: $(VENV)/.all
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/.all
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(VENV)/.all
+	$(BIN)/cosim bench
+
+clean:
+	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(BIN)/python:
+	@command -v $(PYTHON) >/dev/null || { echo "make: Python 3.11 is needed and '$(PYTHON)' was not found; name one with make PYTHON=..." >&2; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+
+# What flying needs and no more: no torch, no vedo.
+$(VENV)/.fly: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing what flying needs into $(VENV) (about 200 MB the first time)"
+	$(PIP) --editable .
+	@touch $@
+
+$(VENV)/.all: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing everything with the extras train, view, export and dev into $(VENV)"
+	$(PIP) --editable '.[train,view,export,dev]'
+	@touch $@ $(VENV)/.fly
