@@ -44,7 +44,7 @@ class Geometry(ABC):
         """Length of each lane's axis (m), (N,)."""
 
     @abstractmethod
-    def rays(self, origins: Floats, directions: Floats, reach: float) -> Floats:
+    def rays(self, origins: Floats, directions: Floats, reach: float, active: Bools | None = None) -> Floats:
         """Distance to the wall along rays, (N, K), at most `reach` (m).
 
         Args:
@@ -52,6 +52,8 @@ class Geometry(ABC):
                 reads the next wall, so that sensors check the way to the origin first.
             directions: (N, K, 3), unit vectors.
             reach: range of the sensor (m).
+            active: (N,) lanes whose rays are wanted, None for all; the rows of the others mean nothing. Rays
+                are most of an environment's time, and a reset needs those of the lanes that were reset alone.
         """
 
     @abstractmethod
