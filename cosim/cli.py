@@ -1,0 +1,115 @@
+"""The command `cosim`: parses, calls, and turns errors into one sentence and an exit status."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
+
+import click
+
+from cosim import __version__
+from cosim.errors import Terminated, exit_status
+from cosim.options import FlightOptions, flight_options
+
+EXIT_NO_SUCCESS: Final = 1
+
+CONTEXT: Final = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
+
+
+@click.group(context_settings=CONTEXT)
+@click.version_option(__version__, prog_name="cosim")
+def cosim() -> None:
+    """Fly a learned drone policy through a tube, in lockstep with a physics engine.
+
+    \b
+    cosim launch                           the shipped policy through the shipped conduit
+    cosim launch --mesh M.obj --policy P   your tube, your policy
+    """
+
+
+@cosim.command(short_help="Fly a policy through a tube in a separate physics process.")
+@flight_options
+@click.option("--require-success", is_flag=True, help="Exit 1 unless the outcome is success.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, nothing else.")
+def launch(require_success: bool, as_json: bool, **options: Any) -> None:
+    """Fly a policy through a tube in a separate physics process.
+
+    \b
+    cosim launch --mesh industrial.obj --policy tube_ppo --seed 3
+    """
+    from cosim.launch import launch as run
+
+    success = run(FlightOptions(**options), as_json=as_json)
+    if require_success and not success:
+        sys.exit(EXIT_NO_SUCCESS)
+
+
+@cosim.command(short_help="Write a recorded run in another format.")
+@click.argument("run", type=click.Path(path_type=Path))
+@click.option("--format", "kind", type=click.Choice(["csv", "npz", "parquet"]), required=True)
+@click.option("--output", "-o", type=click.Path(path_type=Path), help="File [default: RUN/steps.<format>].")
+def export(run: Path, kind: str, output: Path | None) -> None:
+    """Write a recorded run as CSV, NumPy archive or Parquet, from its folder alone.
+
+    \b
+    cosim export runs/2026-... --format parquet
+    """
+    from cosim.export import export as write
+
+    click.echo(write(run, kind, output))
+
+
+@cosim.command(short_help="Train a policy with PPO in the kinematic world.")
+@click.option(
+    "--steps", type=click.IntRange(min=1), default=1_300_000, show_default=True, help="Control steps."
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--envs", type=click.IntRange(min=1), default=65, show_default=True, help="Drones at a time.")
+@click.option("--out", type=click.Path(path_type=Path), default=Path("runs/training"), show_default=True)
+def train(steps: int, seed: int, envs: int, out: Path) -> None:
+    """Train a policy with PPO in the kinematic world, through the curriculum of the paper.
+
+    \b
+    cosim train --steps 1300000 --seed 1 --out runs/mine
+    """
+    from cosim.train import train as run
+
+    run(steps, seed, envs, out)
+
+
+@cosim.command(short_help="Measure round trip, control loop and start-up on this machine.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, nothing else.")
+@click.option("--quick", is_flag=True, help="Fewer samples: a look, not a measurement.")
+def bench(as_json: bool, quick: bool) -> None:
+    """Measure the protocol's round trip, the whole control loop and the start-up, side by side in one run."""
+    from cosim.bench import bench as run
+
+    run(as_json=as_json, quick=quick)
+
+
+def _terminated(_signal: int, _frame: FrameType | None) -> None:
+    raise Terminated
+
+
+def main() -> None:
+    """Entry point of the console script; every error raised on purpose is one sentence on stderr."""
+    signal.signal(signal.SIGTERM, _terminated)
+    try:
+        cosim.main(standalone_mode=False)
+    except click.exceptions.Exit as done:
+        sys.exit(done.exit_code)
+    except click.Abort:
+        sys.exit(exit_status(KeyboardInterrupt()))
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except BaseException as error:  # exit statuses are given here and nowhere else
+        status = exit_status(error)
+        if status is None:
+            raise
+        if str(error):
+            click.echo(f"cosim: {error}", err=True)
+        sys.exit(status)

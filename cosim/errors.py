@@ -1,0 +1,59 @@
+"""What can go wrong around a run, and the exit status of the command for each.
+
+    CosimError                      2
+    ├── OutputError                 2   the run folder cannot be written, or already holds a run
+    ├── RunError                    2   a run folder that cannot be read
+    └── PeerCommandError            2   the physics command cannot be started
+    protocol.errors.ProtocolError   3   the other process or the protocol failed
+    ├── protocol.errors.SessionError    2   our own side asked for what cannot be had (no room, name in use)
+    meshes.errors.MeshError         2   the tube cannot be read
+    agent_client.errors.AgentError  2   policy, contract or settings do not fit
+
+`protocol` and `meshes` import nothing of ours, so each package has one root; this table joins them.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+USAGE: Final = 2
+PEER: Final = 3
+INTERRUPTED: Final = 130
+TERMINATED: Final = 143
+
+
+class CosimError(Exception):
+    """Root of what this package raises on purpose."""
+
+
+class OutputError(CosimError):
+    """A run folder that cannot be made or written; says which and why."""
+
+
+class RunError(CosimError):
+    """A run folder that cannot be read; says what is missing or differs."""
+
+
+class PeerCommandError(CosimError):
+    """A physics command that cannot be started."""
+
+
+class Terminated(BaseException):
+    """SIGTERM arrived; handled like Ctrl-C, so that both processes end and the recording is saved."""
+
+
+def exit_status(error: BaseException) -> int | None:
+    """Exit status for an error, or None for one that nobody raised on purpose."""
+    from agent_client.errors import AgentError
+    from meshes.errors import MeshError
+    from protocol.errors import ProtocolError, SessionError
+
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED
+    if isinstance(error, Terminated):
+        return TERMINATED
+    if isinstance(error, (CosimError, MeshError, AgentError, SessionError)):
+        return USAGE
+    if isinstance(error, ProtocolError):
+        return PEER
+    return None

@@ -1,0 +1,112 @@
+"""The options that every flying command shares, as one frozen object and one click decorator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import click
+
+SHIPPED_MESH: Final = "industrial.obj"
+SHIPPED_POLICY: Final = "tube_ppo"
+DEFAULT_PHYSICS_DT: Final = 1.0 / 240.0
+DEFAULT_ATTACH_SECONDS: Final = 30.0
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class FlightOptions:
+    """What the user asked of one flight; the fields are the options of `cosim launch`."""
+
+    mesh: str = SHIPPED_MESH
+    centerline: Path | None = None
+    policy: str = SHIPPED_POLICY
+    lookahead: float | None = None
+    dt: float | None = None
+    physics_dt: float = DEFAULT_PHYSICS_DT
+    allow_mismatch: tuple[str, ...] = ()
+    max_steps: int | None = None
+    seed: int = 0
+    out: Path | None = None
+    axes: str = "zup"
+    scale: float = 1.0
+    start_end: str = "first"
+    realtime: float | None = None
+    on_contact: str = "end"
+    parameters: tuple[str, ...] = ()
+    compensation: float | None = None
+    server: str | None = None
+    connect: str | None = None
+    session: str | None = None
+    transport: str = "shm"
+    attach_timeout: float = DEFAULT_ATTACH_SECONDS
+
+
+class Fraction(click.ParamType):
+    """A positive number of seconds, also as a fraction such as 1/240."""
+
+    name = "seconds"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Read `0.004`, `1/240` or a number."""
+        try:
+            above, _, below = str(value).partition("/")
+            seconds = float(above) / (float(below) if below else 1.0)
+        except (ValueError, ZeroDivisionError):
+            self.fail(f"expected seconds such as 0.1 or 1/240, found {value!r}", param, ctx)
+        if not 0.0 < seconds < float("inf"):
+            self.fail(f"expected a positive number of seconds, found {value!r}", param, ctx)
+        return seconds
+
+
+def _positive(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
+    """Refuse zero, negative and non-finite values."""
+    if value is not None and not 0.0 < value < float("inf"):
+        raise click.BadParameter(f"expected a positive number, found {value}", ctx, param)
+    return value
+
+
+_OPTIONS: Final = (
+    click.option("--mesh", metavar="PATH", default=SHIPPED_MESH, show_default=True, help="Tube mesh."),
+    click.option("--centerline", type=click.Path(path_type=Path), metavar="PATH", default=None,
+                 help="Centreline .obj [default: <mesh stem>_centerline.obj beside the mesh]."),
+    click.option("--axes", type=click.Choice(["zup", "yup"]), default="zup", help="Up axis of the files."),
+    click.option("--scale", type=float, callback=_positive, default=1.0, help="File units to metres."),
+    click.option("--start-end", type=click.Choice(["first", "last"]), default="first",
+                 help="End of the centreline to start from."),
+    click.option("--policy", metavar="PATH|pure-pursuit", default=SHIPPED_POLICY, show_default=True,
+                 help="Checkpoint, or the baseline that knows the centreline."),
+    click.option("--lookahead", type=float, callback=_positive, metavar="M", help="Of Pure Pursuit (m)."),
+    click.option("--dt", type=Fraction(), help="Control step (s) [default: the checkpoint's]."),
+    click.option("--physics-dt", type=Fraction(), default=DEFAULT_PHYSICS_DT, show_default="1/240",
+                 help="Inner step (s); dt must be a whole multiple."),
+    click.option("--allow-mismatch", type=click.Choice(["dt"]), multiple=True,
+                 help="Fly although this differs from the checkpoint."),
+    click.option("--max-steps", type=click.IntRange(min=1),
+                 help="Step limit [default: 1.5 length / (slowest speed x dt)]."),
+    click.option("--seed", type=click.IntRange(min=0), default=0, help="Of start offset and heading."),
+    click.option("--on-contact", type=click.Choice(["end", "continue"]), default="end",
+                 help="End at the first contact, or count on."),
+    click.option("--parameter", "parameters", multiple=True, metavar="NAME=VALUE",
+                 help="Plant parameter, e.g. force_gain=2."),
+    click.option("--compensation", type=float, metavar="C", help="Gravity compensation c, 1 hovers."),
+    click.option("--realtime", type=float, callback=_positive, metavar="FACTOR",
+                 help="Pace; 1 is wall clock [default: as fast as possible]."),
+    click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [default: new]."),
+    click.option("--server", metavar="COMMAND", help="Start this physics peer as COMMAND RENDEZVOUS."),
+    click.option("--connect", metavar="RENDEZVOUS", help="Wait for a peer that you start; never kill it."),
+    click.option("--session", metavar="NAME", help="Name of the session."),
+    click.option("--transport", type=click.Choice(["shm", "file"]), default="shm", help="Of the buffers."),
+    click.option("--attach-timeout", type=float, callback=_positive, default=DEFAULT_ATTACH_SECONDS,
+                 metavar="S", help="Patience for the peer's attach (s)."),
+)  # fmt: skip
+
+
+def flight_options(command: Command) -> Command:
+    """Give a click command the options of a flight; they arrive as keyword arguments of FlightOptions."""
+    for option in reversed(_OPTIONS):
+        command = option(command)
+    return command

@@ -1,0 +1,58 @@
+"""Reading a run folder: its manifest and its log, also of a run that was cut short."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.errors import RunError
+from cosim.recording import FORMAT, MANIFEST, Column, record_dtype
+
+
+@dataclass(frozen=True)
+class Run:
+    """A recorded run, mapped read-only."""
+
+    folder: Path
+    manifest: dict[str, Any]
+    columns: tuple[Column, ...]
+    records: NDArray[np.void]
+    """One record a control step, the reset pose first; the fields are `columns`."""
+
+
+def read_run(folder: Path) -> Run:
+    """Read a run folder; a log that was cut short ends with its last whole record.
+
+    Raises:
+        RunError: no folder, no manifest, a manifest of another format, or a log that does not fit it.
+    """
+    path = folder / MANIFEST
+    try:
+        manifest = json.loads(path.read_text())
+    except OSError as error:
+        raise RunError(f"{path}: expected the manifest of a run, found none ({error.strerror})") from error
+    except json.JSONDecodeError as error:
+        raise RunError(f"{path}: expected JSON, found text that is not ({error})") from error
+    found = manifest.get("format") if isinstance(manifest, dict) else None
+    if found != FORMAT:
+        raise RunError(f"{path}: format: expected {FORMAT}, found {found}")
+    try:
+        columns = tuple(
+            Column(**{**c, "shape": tuple(c["shape"]), "labels": tuple(c["labels"])})
+            for c in manifest["record"]
+        )
+        log = folder / manifest["log"]
+    except (KeyError, TypeError) as error:
+        raise RunError(f"{path}: the description of a record is damaged ({error})") from error
+    dtype = record_dtype(columns)
+    try:
+        count = log.stat().st_size // dtype.itemsize
+        records = np.memmap(log, dtype, mode="r", shape=(count,)) if count else np.zeros(0, dtype)
+    except OSError as error:
+        raise RunError(f"{log}: expected the log of a run, found none ({error.strerror})") from error
+    return Run(folder, manifest, columns, records)

@@ -1,0 +1,73 @@
+"""Opening a session with a physics process: ours, the user's command, or one that the user starts by hand."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Final
+
+from cosim.errors import CosimError
+from cosim.supervise import PhysicsProcess, physics_command
+from protocol.agent import AgentSession, SessionSettings
+from protocol.errors import ProtocolError
+
+NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+
+
+def rendezvous_of(connect: str | None, name: str | None, transport: str) -> str:
+    """The rendezvous string of a session: as given to --connect, or made from name and transport.
+
+    Raises:
+        CosimError: a name that no transport can carry.
+    """
+    if connect is not None:
+        return connect if ":" in connect else f"{transport}:{connect}"
+    if name is None:
+        name = f"cosim-{os.getpid()}-{time.time_ns() % 1_000_000_000:09d}"
+    if not NAME.fullmatch(name):
+        raise CosimError(f"--session: expected letters, digits, '.', '_' and '-', found {name!r}")
+    return f"shm:{name}" if transport == "shm" else f"file:{Path(tempfile.gettempdir()) / name}"
+
+
+@contextmanager
+def physics_session(
+    rendezvous: str,
+    settings: SessionSettings,
+    *,
+    server: str | None,
+    connect: bool,
+    attach_timeout: float,
+    log_dir: Path,
+) -> Iterator[AgentSession]:
+    """An open session; the process that was started for it, if one was, is ended with it.
+
+    Args:
+        rendezvous: where the two sides meet.
+        settings: lanes and time steps.
+        server: the user's physics command, or None for ours.
+        connect: wait for a peer that somebody else starts, and leave it alone at the end.
+        attach_timeout: patience for the peer's attach (s).
+        log_dir: where the process's stdout and stderr are kept.
+
+    Raises:
+        ProtocolError: the session could not be opened, or failed while it was used; the last lines that the
+            process wrote to its stderr are added as a note.
+    """
+    with ExitStack() as stack:
+        process = None
+        if not connect:
+            process = stack.enter_context(PhysicsProcess(physics_command(server), rendezvous, log_dir))
+        try:
+            watch = None if process is None else process.watch
+            yield stack.enter_context(
+                AgentSession.open(rendezvous, settings, watch=watch, attach_timeout=attach_timeout)
+            )
+        except ProtocolError as error:
+            if process is not None and (words := process.last_words()):
+                error.add_note(f"the physics process said: {words}")
+            raise
