@@ -1,9 +1,9 @@
 """What can go wrong on the agent's side.
 
-    AgentError
-    ├── SettingsError          a setting is out of range, or two settings contradict each other
-    └── PolicyError            a checkpoint that is missing, empty, foreign, or of other spaces
-        └── ContractMismatch   a checkpoint that was made for other sensors, actions or time step than run now
+AgentError
+├── SettingsError          a setting is out of range, or two settings contradict each other
+└── PolicyError            a checkpoint that is missing, empty, foreign, or of other spaces
+    └── ContractMismatch   a checkpoint that was made for other sensors, actions or time step than run now
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Difference:
     """What runs now."""
 
 
-class ContractMismatch(PolicyError):
+class ContractMismatch(PolicyError):  # noqa: N818 - it is named after what it finds
     """A checkpoint whose contract differs from what runs; `differences` lists every disagreement."""
 
     def __init__(self, differences: Sequence[Difference], name: str) -> None:
