@@ -144,7 +144,8 @@ def _read_layers(content: bytes, path: Path) -> tuple[Layer, ...]:
         ):
             raise PolicyError(
                 f"{path}: {ACTOR_FILE}: layer {i}: expected finite float32 weights "
-                f"({inputs or 'inputs'}, outputs) and biases (outputs,), found {weight.dtype} {weight.shape} and {bias.dtype} {bias.shape}"
+                f"({inputs or 'inputs'}, outputs) and biases (outputs,), found {weight.dtype} "
+                f"{weight.shape} and {bias.dtype} {bias.shape}"
             )
         inputs = weight.shape[1]
     return tuple(Layer(np.ascontiguousarray(w), np.ascontiguousarray(b)) for w, b in pairs)
