@@ -124,7 +124,7 @@ def load_policy(path: str | Path) -> Policy:
     Args:
         path: a .zip as `agent_client.training` writes it, or one of stable-baselines3's PPO with the
             observation space Box(37,) and the action space Discrete(36). Of the latter nothing is known but
-            its network: the default contract is assumed, and the policy's `notes` say so. Reading it unpickles
+            its network: the default contract is assumed, and the policy's `notes` say so. Reading unpickles
             its content, as stable-baselines3 does: open only what you trust.
 
     Raises:
