@@ -1,10 +1,10 @@
 """The 36 actions: nine directions inside the camera's cone times four speeds (paper, Action Space).
 
-The action's index is `direction * len(speeds) + speed`. Directions are ordered straight, right, left, up, down,
-then the corners right-up, right-down, left-up, left-down. A pair of angles (alpha, beta) becomes the unit vector
-along f + tan(alpha) r + tan(beta) u, with f, u, r the drone's own axes: the point that the camera sees under
-those angles. The paper excludes backward-facing directions; below a right angle none of these faces backward,
-so that its constraint holds for every action and nothing is left to check.
+The action's index is `direction * len(speeds) + speed`. Directions are ordered straight, right, left, up,
+down, then the corners right-up, right-down, left-up, left-down. A pair of angles (alpha, beta) becomes the
+unit vector along f + tan(alpha) r + tan(beta) u, with f, u, r the drone's own axes: the point that the camera
+sees under those angles. The paper excludes backward-facing directions; below a right angle none of these
+faces backward, so that its constraint holds for every action and nothing is left to check.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from agent_client.episodes import Records
 from agent_client.settings import Settings
 
 Floats = NDArray[np.float64]
@@ -53,23 +54,22 @@ def action_table(settings: Settings) -> ActionTable:
 
 
 @njit(cache=True)
-def decode(actions: Ints, frame: Floats, local: Floats, speed: Floats, commands: Floats) -> None:
+def decode(actions: Ints, episodes: Records, local: Floats, speed: Floats, commands: Floats) -> None:
     """Write the direction and the speed of each lane's action into the rows of a command block.
 
     Args:
         actions: (N,) action indices, each within the table.
-        frame: (N, 3, 3) rows f, u, r: the drones' local axes in the world frame.
+        episodes: (N,) records; `frame` is read.
         local: (A, 3) directions of the table, local frame.
         speed: (A,) speeds of the table (m/s).
         commands: (N, 8) block of `protocol.plant.CommandBatch`; words 0 to 3 are written.
     """
     for i in range(actions.shape[0]):
-        a = actions[i]
-        x, y, z = 0.0, 0.0, 0.0
-        for k in range(3):
-            x += local[a, k] * frame[i, k, 0]
-            y += local[a, k] * frame[i, k, 1]
-            z += local[a, k] * frame[i, k, 2]
-        norm = np.sqrt(x * x + y * y + z * z)
-        commands[i, 0], commands[i, 1], commands[i, 2] = x / norm, y / norm, z / norm
+        a, frame = actions[i], episodes[i].frame
+        norm = 0.0
+        for c in range(3):
+            commands[i, c] = local[a, 0] * frame[0, c] + local[a, 1] * frame[1, c] + local[a, 2] * frame[2, c]
+            norm += commands[i, c] ** 2
+        for c in range(3):
+            commands[i, c] /= np.sqrt(norm)
         commands[i, 3] = speed[a]

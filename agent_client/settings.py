@@ -1,11 +1,12 @@
 """Every constant of the task, once, with its unit and its source.
 
-"Paper" names a section of the article that the project reproduces; "our choice" marks what it leaves open. The
-learning scale is a tube of R = 1 m. Everything on the drone is in metres and does not scale with the tube.
+"Paper" names a section of the article that the project reproduces; "our choice" marks what it leaves open.
+The learning scale is a tube of R = 1 m. What is on the drone is in metres and does not scale with the tube.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, field
 from typing import Final
@@ -49,7 +50,7 @@ class CameraSettings:
     half_height: float = math.radians(35.0)
     """Vertical half-angle of the field of view (rad), theta_max^(b)."""
     target_distance: float = 3.0
-    """How far ahead of the drone on the axis the target lies (m, arc length); at the end of the tube its end."""
+    """How far ahead of the drone on the axis the target lies (m, arc length), at most the tube's end."""
     depth_scale: float = 4.0
     """Distance (m) at which the depth feature reaches 1; a target that is not seen reads 1 too."""
 
@@ -104,12 +105,12 @@ class TaskSettings:
     """Step limit over the steps that the axis takes at the slowest speed. Our choice."""
     safety_scale: float = 0.3
     """Free distance (m) between body and nearest LiDAR return at which the second safety metric reaches 1.
-    The paper does not define the metric; ours resolves the last 0.3 m before a touch, where l_min is coarse."""
+    The paper does not define the metric; ours resolves the last 0.3 m before a touch, l_min being coarse."""
 
 
 @dataclass(frozen=True)
 class RewardSettings:
-    """Constants of the reward that the paper leaves open, and its terminal rewards (paper, Reward Shaping)."""
+    """What the paper leaves open in its reward, and its terminal rewards (paper, Reward Shaping)."""
 
     per_metre: bool = True
     """Multiply the per-step terms by the step's progress over v_max dt. A departure from the paper, whose
@@ -204,4 +205,4 @@ def _rules(s: Settings) -> tuple[tuple[str, object, str, bool], ...]:
 
 
 def _ascending(speeds: tuple[float, ...]) -> bool:
-    return bool(speeds) and speeds[0] > 0.0 and all(a < b for a, b in zip(speeds, speeds[1:], strict=False))
+    return bool(speeds) and speeds[0] > 0.0 and all(a < b for a, b in itertools.pairwise(speeds))

@@ -1,0 +1,131 @@
+"""Where each drone is in its tube, how its episode stands, and how clean its flight has been."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from agent_client.episodes import Records
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+class Outcome(IntEnum):
+    """How an episode stands. The paper counts exits and collisions together as exits."""
+
+    RUNNING = 0
+    SUCCESS = 1
+    """Within the success radius of the tube's end."""
+    EXIT = 2
+    """The centre left the tube other than through its end."""
+    COLLISION = 3
+    """The body touched the wall."""
+    TIMEOUT = 4
+    """The step limit was reached."""
+
+
+@njit(cache=True)
+def place(
+    lanes: Ints,
+    episodes: Records,
+    poses: Floats,
+    arc_length: Floats,
+    position: Floats,
+    tangent: Floats,
+    radial_distance: Floats,
+    radius: Floats,
+    inside: Bools,
+    clearance: Floats,
+    near: Floats,
+    fresh: bool,
+) -> None:
+    """Take over what the geometry found, and the velocity along the body.
+
+    Args:
+        lanes: (K,) the lanes to compute.
+        episodes: (N,) records; `frame` is read.
+        poses: (N, 16) block of `protocol.plant.PoseBatch`.
+        arc_length: (N,), with the next four the fields of `meshes.geometry.AxisPoints`.
+        position: (N, 3).
+        tangent: (N, 3).
+        radial_distance: (N,).
+        radius: (N,).
+        inside: (N,) whether the centre is inside the tube.
+        clearance: (N,) distance of the centre to the wall (m).
+        near: (N,) output: where the next search of the axis begins.
+        fresh: whether an episode begins here, so that nothing came before.
+    """
+    for k in range(lanes.shape[0]):
+        i = lanes[k]
+        e = episodes[i]
+        speed = 0.0
+        for c in range(3):
+            e.axis_position[c], e.tangent[c] = position[i, c], tangent[i, c]
+            speed += poses[i, 7 + c] * e.frame[0, c]
+        e.speed_before = speed if fresh else e.speed
+        e.arc_before = arc_length[i] if fresh else e.arc_length
+        e.speed, e.arc_length, near[i] = speed, arc_length[i], arc_length[i]
+        e.radial_distance, e.radius = radial_distance[i], radius[i]
+        e.progress = min(max(e.arc_length / e.length, 0.0), 1.0)
+        e.inside, e.clearance = inside[i], clearance[i]
+        if e.outcome == 0:
+            e.min_clearance = min(e.min_clearance, e.clearance)
+
+
+@njit(cache=True)
+def judge(lanes: Ints, episodes: Records, constants: Records, poses: Floats, words: Ints) -> None:
+    """Count the step, decide how each episode stands after it, and renew its quality index.
+
+    Several ends in one step rank collision, success, exit, timeout: a body that leaves through the wall has
+    touched it. Success is measured along the axis and holds inside the tube, or past its end where the drone
+    went through the end's opening. Q is the paper's Navigation Quality Index: half the mean centring, half
+    the mean alignment normalised to [0, 1], over the steps inside the tube.
+
+    Args:
+        lanes: (K,) the lanes to compute.
+        episodes: (N,) records after perception.
+        constants: (1,) record of the task's constants.
+        poses: (N, 16) block of `protocol.plant.PoseBatch`.
+        words: the same block as int64.
+    """
+    constant = constants[0]
+    for k in range(lanes.shape[0]):
+        i = lanes[k]
+        e = episodes[i]
+        e.live = e.outcome == 0
+        if not e.live:
+            continue
+        e.step += 1
+        along, square = 0.0, 0.0
+        for c in range(3):
+            offset = poses[i, c] - e.axis_position[c]
+            along += offset * e.tangent[c]
+            square += offset * offset
+        at_end = e.arc_length >= e.length - 1e-9
+        through_end = at_end and along > 0.0 and square - along * along <= e.radius * e.radius
+        near_end = e.length - e.arc_length <= constant.success_radius * e.radius
+        e.contact = words[i, 14] > 0 or (e.clearance < constant.touch and not through_end)
+        if e.contact:
+            e.contacts += 1
+        if e.contact and constant.end_on_contact > 0.0:
+            e.outcome = 3
+        elif near_end and (e.inside or through_end):
+            e.outcome = 1
+        elif not e.inside:
+            e.outcome = 2
+        elif e.step >= e.max_steps:
+            e.outcome = 4
+        if constant.reward_length > 0.0:
+            e.gain = (e.arc_length - e.arc_before) / constant.reward_length
+        else:
+            e.gain = 1.0
+        if e.inside:
+            e.steps_inside += 1
+            e.sum_centring += e.centring
+            e.sum_alignment += 0.5 * (e.alignment + 1.0)
+            e.quality = 0.5 * (e.sum_centring + e.sum_alignment) / e.steps_inside

@@ -1,0 +1,235 @@
+"""The task: N episodes of flight through tubes, from poses to observations, rewards, ends and quality.
+
+One implementation serves training and flying. A pose that comes back from physics goes round once: local
+frame, nearest axis point, rays, camera, memory, verdict, reward, features; each quantity is computed once.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent_client.camera import look, remember
+from agent_client.episodes import OnContact, Records, constants, episode_dtype
+from agent_client.errors import SettingsError
+from agent_client.features import FEATURES, compute_features, feature_mask
+from agent_client.frames import local_frames
+from agent_client.judge import Outcome, judge, place
+from agent_client.lidar import SPOKES, place_rays, read_rings, ring_circle, ring_sectors
+from agent_client.reward import Regime, choose_regimes, score
+from agent_client.settings import Settings, max_steps
+from meshes.geometry import AxisPoints, Geometry
+from protocol.plant import PoseBatch
+
+__all__ = ["OnContact", "Outcome", "Regime", "TaskStep", "TubeTask"]
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Bytes = NDArray[np.int8]
+
+
+@dataclass(frozen=True)
+class TaskStep:
+    """Everything about N episodes after a control step. Positions and directions are in the world frame.
+
+    The arrays are the task's own and change with its next call; copy what you keep.
+    """
+
+    episodes: Records  # (N,)
+    """The records (`agent_client.episodes`) that all fields below but the observation are views of."""
+    observation: Singles  # (N, 37)
+    """Features in the order of `agent_client.features.FEATURES`."""
+    reward: Floats  # (N,)
+    """Reward of the step; 0 after `begin` and once an episode is over."""
+    reward_terms: Floats  # (N, T)
+    """The reward's terms, columns `agent_client.reward.TERMS`; they sum to `reward`."""
+    regime: Bytes  # (N,)
+    """Values of Regime."""
+    outcome: Bytes  # (N,)
+    """Values of Outcome; stays as it is once an episode is over, until `begin`."""
+    step: Ints  # (N,)
+    """Control steps of the episode; stops when it is over."""
+    max_steps: Ints  # (N,)
+    """Control steps after which it times out."""
+    frame: Floats  # (N, 3, 3)
+    """Local frame: rows f, u, r."""
+    axis: AxisPoints
+    """Nearest points of the axis."""
+    progress: Floats  # (N,)
+    """Arc length of the nearest axis point over the tube's length, 0 to 1."""
+    inside: Bools  # (N,)
+    """Whether the centre is inside the tube."""
+    clearance: Floats  # (N,)
+    """Distance of the centre to the wall (m), negative outside."""
+    contact: Bools  # (N,)
+    """Whether the body touched the wall in this step."""
+    lidar: Floats  # (N, 2 rays)
+    """Readings (m): front ring, then rear ring."""
+    target_position: Floats  # (N, 3)
+    """The camera's target: a point of the axis (m)."""
+    target_direction: Floats  # (N, 3)
+    """Unit vector to it, seen or not."""
+    target_distance: Floats  # (N,)
+    """Distance to it (m)."""
+    target_visible: Bools  # (N,)
+    memory_direction: Floats  # (N, 3)
+    """Direction in which the target was seen last; zero without memory."""
+    memory_age: Ints  # (N,)
+    """Control steps since then; one more than the memory's length without memory."""
+    memory_available: Bools  # (N,)
+    centring: Floats  # (N,)
+    """S_center = clip(1 - d / R, 0, 1)."""
+    alignment: Floats  # (N,)
+    """S_align in [-1, 1]."""
+    quality: Floats  # (N,)
+    """Q of the episode so far: mean of centring and of (alignment + 1) / 2, half each, over its control steps
+    inside the tube; 0 before the first."""
+    contacts: Ints  # (N,)
+    """Control steps of the episode with contact."""
+    min_clearance: Floats  # (N,)
+    """Smallest clearance of the episode so far, the start included (m)."""
+
+    @classmethod
+    def over(cls, episodes: Records) -> TaskStep:
+        """The step whose fields are views of `episodes`."""
+        axis = AxisPoints(
+            arc_length=episodes["arc_length"],
+            position=episodes["axis_position"],
+            tangent=episodes["tangent"],
+            radial_distance=episodes["radial_distance"],
+            radius=episodes["radius"],
+        )
+        observation = np.zeros((len(episodes), len(FEATURES)), dtype=np.float32)
+        shared = set(cls.__dataclass_fields__) & set(episodes.dtype.names or ())
+        views: dict[str, Any] = {name: episodes[name] for name in shared}
+        return cls(episodes=episodes, observation=observation, axis=axis, **views)
+
+
+class TubeTask:
+    """N episodes, lane i in the tube that the geometry assigns to it.
+
+    Args:
+        geometry: the tubes; its lanes are the task's.
+        settings: constants of the task.
+        dt: control step (s).
+        kinematic: how contact is known: True, the clearance falls below the body's radius (the kinematic
+            world has no walls); False, the poses report it.
+        on_contact: "end" ends an episode with COLLISION, "continue" counts contacts and lets the rest decide.
+        step_limit: control steps after which an episode times out, None for `max_steps` of each tube.
+
+    Raises:
+        SettingsError: dt or the step limit is not above 0, or a masked feature does not exist.
+    """
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        settings: Settings,
+        dt: float,
+        *,
+        kinematic: bool,
+        on_contact: OnContact = "end",
+        step_limit: int | None = None,
+    ) -> None:
+        if not (math.isfinite(dt) and dt > 0.0):
+            raise SettingsError(f"dt: expected a time above 0 s, found {dt}")
+        if step_limit is not None and step_limit < 1:
+            raise SettingsError(f"step_limit: expected at least 1 step, found {step_limit}")
+        n, rays = geometry.lanes, settings.lidar.rays
+        self.geometry, self.settings, self.dt = geometry, settings, dt
+        self.ray_nanoseconds = 0
+        """How long rays and lines of sight took in the last call."""
+        self._step_limit = step_limit
+        self._constants = constants(settings, dt, kinematic=kinematic, on_contact=on_contact)
+        self._mask = feature_mask(settings.masked_features)
+        self._episodes: Records = np.zeros(n, dtype=episode_dtype(rays))
+        self._episodes["max_steps"] = 1
+        self._step = TaskStep.over(self._episodes)
+        self._all: Ints = np.arange(n)
+        self._position = np.zeros((n, 3))
+        self._ahead = np.zeros(n)
+        self._near: Floats = np.full(n, np.nan)
+        self._origins = np.zeros((n, SPOKES + 2 * rays, 3))
+        self._directions = np.zeros_like(self._origins)
+        self._circle, self._sectors = ring_circle(rays), ring_sectors(rays)
+
+    @property
+    def lanes(self) -> int:
+        """Number of episodes N."""
+        return self.geometry.lanes
+
+    def begin(self, lanes: Ints, poses: PoseBatch) -> TaskStep:
+        """Start new episodes in some lanes, in the geometry's present tubes, and take their first look.
+
+        Args:
+            lanes: (K,) distinct lane indices.
+            poses: (N,) poses; those of other lanes have no effect.
+
+        Returns:
+            The step of all lanes; other lanes' rows are as they were.
+        """
+        lanes = np.ascontiguousarray(lanes, dtype=np.int64)
+        episodes, length = self._episodes, self.geometry.length[lanes]
+        limits = [self._step_limit or max_steps(self.settings, float(metres), self.dt) for metres in length]
+        episodes[lanes] = np.zeros((), dtype=episodes.dtype)
+        episodes["length"][lanes] = length
+        episodes["max_steps"][lanes] = limits
+        episodes["memory_age"][lanes] = self.settings.memory.steps + 1
+        episodes["min_clearance"][lanes] = np.inf
+        self._near[lanes] = np.nan
+        active = None
+        if len(lanes) < self.lanes:
+            active = np.zeros(self.lanes, dtype=np.bool_)
+            active[lanes] = True
+        self._perceive(lanes, poses, active, fresh=True)
+        self._describe(lanes, poses)
+        return self._step
+
+    def observe(self, poses: PoseBatch) -> TaskStep:
+        """Take in the poses that answer a control step: perception, ends, rewards and observations.
+
+        Lanes whose episode is over keep their outcome and counters and earn nothing.
+        """
+        lanes, episodes = self._all, self._episodes
+        self._perceive(lanes, poses, None, fresh=False)
+        judge(lanes, episodes, self._constants, poses.raw, poses.raw.view(np.int64))
+        score(lanes, episodes, self._constants)
+        self._describe(lanes, poses)
+        return self._step
+
+    def _perceive(self, lanes: Ints, poses: PoseBatch, active: Bools | None, *, fresh: bool) -> None:
+        """Sense: local frame, place in the tube, LiDAR, camera, memory and regime of `lanes`."""
+        geometry, episodes, constant, raw = self.geometry, self._episodes, self._constants, poses.raw
+        position = self._position
+        np.copyto(position, poses.position)  # contiguous, so that compiled queries see one layout
+        local_frames(lanes, episodes, raw)
+        place_rays(lanes, episodes, constant, raw, self._circle, self._origins, self._directions)
+        axis = geometry.project(position, self._near)
+        np.add(axis.arc_length, self.settings.camera.target_distance, out=self._ahead)
+        targets, _ = geometry.axis(self._ahead)
+        started = time.perf_counter_ns()
+        distances = geometry.rays(self._origins, self._directions, self.settings.lidar.reach, active)
+        clear = geometry.visible(position, targets)
+        self.ray_nanoseconds = time.perf_counter_ns() - started
+        inside, clearance = geometry.inside(position, axis), geometry.clearance(position, axis)
+        place(
+            lanes, episodes, raw, axis.arc_length, axis.position, axis.tangent, axis.radial_distance,
+            axis.radius, inside, clearance, self._near, fresh,
+        )  # fmt: skip
+        read_rings(lanes, episodes, constant, distances, self._sectors)
+        look(lanes, episodes, constant, raw, targets, clear)
+        remember(lanes, episodes, constant)
+        choose_regimes(lanes, episodes)
+
+    def _describe(self, lanes: Ints, poses: PoseBatch) -> None:
+        """Write the observations of `lanes`."""
+        compute_features(
+            lanes, self._episodes, self._constants, poses.raw, self._mask, self._step.observation
+        )
