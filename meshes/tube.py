@@ -250,7 +250,7 @@ def _local_radius(tube: Tube) -> Floats:
         raise CentrelineError(
             f"{tube.centreline_path}: expected a centreline inside of the tube {tube.path.name}, found at "
             f"arc length {tube.arc_length[i]:.2f} m of {tube.length:.2f} m {found}, and {wrong.sum()} such "
-            f"points of {len(wrong)}; check that both files have the same axes and unit, and that it ends inside"
+            f"points of {len(wrong)}; check that both files have the same axes and unit"
         )
     return np.where(hit, distances, 0.0).sum(axis=1) / hits  # type: ignore[no-any-return]
 
