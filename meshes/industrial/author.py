@@ -7,9 +7,9 @@ Run it with Blender's Python module, which is needed for this and for nothing el
 
 The files go beside this script unless a folder is named, and are byte-identical from run to run.
 
-The conduit is a steel pipe of about 2 m in diameter: straight runs and elbows in all three dimensions, one of them
-a vertical rise, a reducer, an expander, weld beads where runs and elbows meet, flanges with bolts, and posts down
-to the ground. Inside there is nothing but the wall and its weld beads. World frame: Z up, metres.
+The conduit is a steel pipe of about 2 m in diameter: straight runs and elbows in all three dimensions, one run
+a vertical rise, a reducer, an expander, weld beads where runs and elbows meet, flanges with bolts, and posts
+down to the ground. Inside there is nothing but the wall and its weld beads. World frame: Z up, metres.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class Parts:
     faces: list[tuple[int, ...]] = field(default_factory=list)
 
     def lathe(self, at: Vector, axis: Vector, profile: list[tuple[float, float]], sides: int) -> None:
-        """Turn a closed profile of (distance from the axis, distance along it) around an axis through `at`."""
+        """Turn a closed profile of (distance from the axis, height along it) around an axis through `at`."""
         one, other = basis(axis)
         base, count = len(self.vertices), len(profile)
         for i in range(sides):
@@ -137,7 +137,8 @@ def basis(axis: Vector) -> tuple[Vector, Vector]:
 def stations() -> list[Station]:
     """Walk the route."""
     position, direction, radius = np.array(START), unit(START_DIRECTION), START_RADIUS
-    places, handles = [(position, direction, radius)], []
+    places = [(position, direction, radius)]
+    handles: list[float] = []
     for part in ROUTE:
         if isinstance(part, Run):
             position = position + part.length * direction
@@ -146,14 +147,12 @@ def stations() -> list[Station]:
         else:
             onward = unit(part.direction)
             angle = np.arccos(direction @ onward)
-            corner = part.bend_radius * np.tan(
-                angle / 2
-            )  # from either end of the arc to where the runs would meet
-            position = position + corner * (direction + onward)
+            # From either end of the arc to the corner where the runs would meet.
+            leg = part.bend_radius * np.tan(angle / 2)
+            position = position + leg * (direction + onward)
             direction = onward
-            handles.append(
-                part.bend_radius * 4 / 3 * np.tan(angle / 4)
-            )  # the cubic nearest to a circular arc
+            # The cubic nearest to a circular arc.
+            handles.append(part.bend_radius * 4 / 3 * float(np.tan(angle / 4)))
         places.append((position, direction, radius))
     return [
         Station(*place, back, on)
@@ -181,7 +180,7 @@ def guide_curve(name: str, route: list[Station], resolution: int) -> bpy.types.O
 
 
 def to_mesh(thing: bpy.types.Object) -> None:
-    """Convert in place, modifiers and bevel applied: a bevelled curve exported as it is would be written twice."""
+    """Convert in place, with bevel and modifiers: a bevelled curve exported as it is would be written twice."""
     select([thing])
     bpy.ops.object.convert(target="MESH")
 
