@@ -18,12 +18,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from meshes.compiled import compiled
 from meshes.errors import CurveError
-
-Floats = NDArray[np.float64]
+from meshes.geometry import Floats
 
 STEP = 0.2
 """Arc length between two points of a curve (m)."""

@@ -16,8 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from meshes.compiled import compiled
-from meshes.curves import Curve, Floats
+from meshes.curves import Curve
 from meshes.errors import CurveError
+from meshes.geometry import Floats
 
 
 @dataclass(frozen=True, eq=False)

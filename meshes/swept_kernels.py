@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshes.compiled import compiled
+from meshes.geometry import Floats
 
-Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 WINDOW = 2.0
