@@ -1,20 +1,19 @@
-"""From what the user named to what is flown: mesh, policy, time steps and plant parameters, or a clear refusal."""
+"""From what the user named to what is flown: tube, policy, time steps and plant parameters, or a refusal."""
 
 from __future__ import annotations
 
+import hashlib
 import math
-import os
-import re
-import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, cast
 
 import agent_client
+from agent_client.contract import require_match, running_contract
 from agent_client.controllers import Controller, PolicyController, PurePursuit
 from agent_client.policy import Policy, load_policy
 from agent_client.settings import DEFAULT_DT, Settings
-from cosim.errors import CosimError, OutputError
+from cosim.errors import CosimError
 from cosim.options import SHIPPED_MESH, SHIPPED_POLICY, FlightOptions
 from meshes.mesh_geometry import MeshGeometry
 from meshes.tube import INDUSTRIAL, Tube, read_tube
@@ -25,40 +24,61 @@ SHIPPED_CHECKPOINT: Final = Path(agent_client.__file__).parent / "policies" / "t
 
 
 @dataclass(frozen=True)
-class Inputs:
-    """Everything that one flight needs, read and checked, before any process is started."""
+class Pilot:
+    """Who flies: a controller, under what settings and time step, and how the manifest describes it."""
 
-    tube: Tube
-    geometry: MeshGeometry
     controller: Controller
-    policy: Policy | None
     settings: Settings
     dt: float
-    parameters: dict[str, float]
+    description: dict[str, Any]
     notes: tuple[str, ...]
-    """What was chosen for the user, to be said."""
 
 
-def resolve(name: str, shipped_name: str, shipped: Path, what: str) -> tuple[Path, str | None]:
-    """The path of a mesh or policy; the shipped one where it is named and no such file exists."""
-    path = Path(name)
-    if name == shipped_name and not path.exists():
-        return shipped, f"{what}: {shipped_name} is the shipped one"
-    return path, None
+def read_tube_input(options: FlightOptions) -> tuple[Tube, tuple[str, ...]]:
+    """The tube that the options name, and what has to be said about it.
+
+    Raises:
+        MeshError: the mesh or its centreline cannot be used.
+    """
+    path, notes = _shipped(options.mesh, SHIPPED_MESH, INDUSTRIAL, "mesh")
+    tube = read_tube(path, options.centerline, options.axes, options.scale, options.start_end)  # type: ignore[arg-type]
+    if tube.wall.duplicate_faces:
+        notes += (f"mesh: {tube.wall.duplicate_faces} duplicate faces dropped",)
+    return tube, notes
+
+
+def read_pilot(options: FlightOptions, tube: Tube, geometry: MeshGeometry) -> Pilot:
+    """The controller that the options name, checked against what will run.
+
+    Raises:
+        AgentError: a checkpoint that cannot be read, or whose contract differs from what would run.
+    """
+    raise NotImplementedError
 
 
 def parse_parameters(pairs: tuple[str, ...]) -> dict[str, float]:
-    """Plant parameters from NAME=VALUE pairs."""
+    """Plant parameters from NAME=VALUE pairs.
+
+    Raises:
+        CosimError: an unknown name, or a value that is no finite number.
+    """
     values = {}
     for pair in pairs:
-        name, equals, text = pair.partition("=")
-        if not equals or name not in PARAMETER_INDEX:
+        name, _, text = pair.partition("=")
+        if name not in PARAMETER_INDEX:
             known = ", ".join(PARAMETER_INDEX)
-            raise CosimError(f"--parameter: expected NAME=VALUE with a name of {known}; found {pair!r}")
+            raise CosimError(f"--parameter: expected NAME=VALUE with a name out of {known}; found {pair!r}")
         try:
             values[name] = float(text)
         except ValueError:
-            raise CosimError(f"--parameter {name}: expected a number, found {text!r}") from None
+            values[name] = math.nan
         if not math.isfinite(values[name]):
             raise CosimError(f"--parameter {name}: expected a finite number, found {text!r}")
     return values
+
+
+def _shipped(name: str, shipped_name: str, shipped: Path, what: str) -> tuple[Path, tuple[str, ...]]:
+    """The path that was named; the shipped file where its name is given and no such file exists."""
+    if name == shipped_name and not Path(name).exists():
+        return shipped, (f"{what}: {shipped_name} is the shipped one",)
+    return Path(name), ()

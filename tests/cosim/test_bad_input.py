@@ -1,0 +1,114 @@
+"""Bad input: exit status 2, one clear sentence, nothing left behind."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from flights import Done
+
+SQUARE_TUBE = """v 0 1 1\nv 0 -1 1\nv 0 -1 -1\nv 0 1 -1\nv 9 1 1\nv 9 -1 1\nv 9 -1 -1\nv 9 1 -1
+f 1 2 6 5\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8\n"""
+
+
+def tube(folder: Path, centreline: str | None) -> str:
+    """A square tube of 9 m along x, with this text as its centreline file."""
+    (folder / "tube.obj").write_text(SQUARE_TUBE)
+    if centreline is not None:
+        (folder / "tube_centerline.obj").write_text(centreline)
+    return str(folder / "tube.obj")
+
+
+def refused(done: Done, folder: Path, *words: str) -> None:
+    """Status 2, one line that contains the words, nothing on stdout, no run folder."""
+    assert done.status == 2, done.stderr
+    assert done.stdout == ""
+    sentences = [line for line in done.stderr.splitlines() if not line.startswith(("mesh:", "policy:"))]
+    assert len(sentences) == 1 or sentences[0].startswith("Usage"), done.stderr
+    for word in words:
+        assert word in done.stderr
+    assert not (folder / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, ("No such file", "nowhere.obj")),
+        ("# nothing\n", ("face",)),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", ("face",)),
+        ("v 0 0\nf 1 2 3\n", ("line 1",)),
+        ("v 0 0 0\ncstype bspline\ncurv 0 1 1\n", ("NURBS",)),
+    ],
+    ids=["missing", "empty", "no faces", "malformed", "nurbs"],
+)
+def test_a_mesh_that_cannot_be_used(
+    fly: Callable[..., Done], tmp_path: Path, text: str | None, words: tuple[str, ...]
+) -> None:
+    """A mesh that is missing, unreadable, without faces, or exported as NURBS is refused."""
+    path = tmp_path / "nowhere.obj"
+    if text is not None:
+        path.write_text(text)
+    done = fly("--mesh", str(path))
+    assert done.status == 2, done.stderr
+    assert any(word.lower() in done.stderr.lower() for word in words), done.stderr
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("centreline", "words"),
+    [
+        (None, ("tube_centerline.obj",)),
+        ("v 0 0 0\nv 5 0 0\nv 9 0 0\nv 5 1 0\nl 1 2\nl 2 3\nl 2 4\n", ("branch",)),
+        ("v 0 5 0\nv 9 5 0\nl 1 2\n", ("inside",)),
+        ("v 0 0 0\nv 1 0 0\n", ("segment",)),
+    ],
+    ids=["none beside the mesh", "branches", "outside", "no segments"],
+)
+def test_a_centreline_that_cannot_be_used(
+    fly: Callable[..., Done], tmp_path: Path, centreline: str | None, words: tuple[str, ...]
+) -> None:
+    """A centreline that is missing, branches, or lies outside of the tube is refused."""
+    refused(fly("--mesh", tube(tmp_path, centreline)), tmp_path, *words)
+
+
+def test_a_named_centreline_that_is_missing(fly: Callable[..., Done], tmp_path: Path) -> None:
+    """A centreline that was named is not replaced by another."""
+    mesh = tube(tmp_path, "v 0 0 0\nv 9 0 0\nl 1 2\n")
+    refused(fly("--mesh", mesh, "--centerline", str(tmp_path / "other.obj")), tmp_path, "other.obj")
+
+
+def test_a_checkpoint_that_cannot_be_used(fly: Callable[..., Done], tmp_path: Path) -> None:
+    """A checkpoint that is missing, empty or foreign is refused by name."""
+    refused(fly("--policy", str(tmp_path / "none.zip")), tmp_path, "none.zip", "no such file")
+    (tmp_path / "empty.zip").touch()
+    refused(fly("--policy", str(tmp_path / "empty.zip")), tmp_path, "empty file")
+    with zipfile.ZipFile(tmp_path / "foreign.zip", "w") as archive:
+        archive.writestr("letter.txt", "hello")
+    refused(fly("--policy", str(tmp_path / "foreign.zip")), tmp_path, "foreign")
+
+
+def test_time_steps_that_do_not_divide(fly: Callable[..., Done], tmp_path: Path) -> None:
+    """A dt that is no whole multiple of the inner step is refused and the nearest one is named."""
+    done = fly("--physics-dt", "0.03", "--policy", "pure-pursuit")
+    refused(done, tmp_path, "0.09")
+
+
+def test_an_output_folder_that_cannot_be_written(fly: Callable[..., Done], tmp_path: Path) -> None:
+    """A folder below a file, or one that already holds a run, is refused."""
+    (tmp_path / "file").touch()
+    refused(fly("--out", str(tmp_path / "file" / "below")), tmp_path, "below")
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "manifest.json").write_text("{}")
+    refused(fly("--out", str(tmp_path / "old")), tmp_path, "old", "already")
+
+
+def test_values_out_of_range(fly: Callable[..., Done], tmp_path: Path) -> None:
+    """Options with impossible values are refused before anything is started."""
+    refused(fly("--scale", "-1"), tmp_path, "--scale")
+    refused(fly("--parameter", "mess=1"), tmp_path, "mess", "mass")
+    refused(fly("--parameter", "mass=heavy"), tmp_path, "mass", "heavy")
+    refused(fly("--compensation", "3"), tmp_path, "compensation")
+    refused(fly("--server", "/no/such/program"), tmp_path, "/no/such/program")
+    refused(fly("--session", "a/b"), tmp_path, "a/b")

@@ -1,0 +1,171 @@
+"""Interrupted and killed flights: typed ends, saved recordings, no process and no shared memory left."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flights import DEADLINE, ROOT, Done, command, environment
+
+from cosim.runs import read_run
+
+SLOW = ("--realtime", "1", "--max-steps", "400")
+"""A flight that lasts long enough to be disturbed."""
+
+
+@contextmanager
+def flying(session: str, folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """A flight under way: at least five steps are on disk when the body runs."""
+    process = subprocess.Popen(
+        command("launch", "--session", session, "--out", str(folder), *SLOW, *arguments),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=folder.parent,
+        env=environment(),
+    )
+    try:
+        wait_until(lambda: recorded(folder) >= 5 or process.poll() is not None)
+        assert process.poll() is None, process.communicate()
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def wait_until(holds: Callable[[], bool]) -> None:
+    """Poll until something holds, or fail at the deadline."""
+    deadline = time.monotonic() + DEADLINE
+    while not holds():
+        assert time.monotonic() < deadline, "deadline passed"
+        time.sleep(0.02)
+
+
+def recorded(folder: Path) -> int:
+    """Whole records on disk so far."""
+    log = folder / "steps.bin"
+    return log.stat().st_size // 1000 if log.exists() else 0
+
+
+def physics_pid(folder: Path) -> int:
+    """Process id of the physics process of a flight."""
+    return int(read_run(folder).manifest["physics_pid"])
+
+
+def gone(pid: int) -> bool:
+    """Whether a process has ended (a zombie has)."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] in "ZX"
+    except FileNotFoundError:
+        return True
+
+
+def test_ctrl_c_saves_the_run_and_ends_both_processes(session_name: str, tmp_path: Path) -> None:
+    """SIGINT exits with 130, the recording says so, and the physics process is gone."""
+    folder = tmp_path / "run"
+    with flying(session_name, folder) as process:
+        physics = physics_pid(folder)
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=DEADLINE)
+        assert process.returncode == 130, stderr
+        assert "Traceback" not in stderr
+    assert gone(physics)
+    run = read_run(folder)
+    assert run.manifest["status"] == "interrupted"
+    assert run.manifest["records"] == len(run.records) >= 5
+
+
+def test_sigterm_ends_both_processes(session_name: str, tmp_path: Path) -> None:
+    """SIGTERM is handled like Ctrl-C and exits with 143."""
+    folder = tmp_path / "run"
+    with flying(session_name, folder) as process:
+        physics = physics_pid(folder)
+        process.terminate()
+        process.communicate(timeout=DEADLINE)
+        assert process.returncode == 143
+    assert gone(physics)
+
+
+def test_a_killed_physics_process_is_reported(session_name: str, tmp_path: Path) -> None:
+    """kill -9 of the physics process exits with 3, names the signal and the step, and the recording is kept."""
+    folder = tmp_path / "run"
+    with flying(session_name, folder) as process:
+        os.kill(physics_pid(folder), signal.SIGKILL)
+        _, stderr = process.communicate(timeout=DEADLINE)
+        assert process.returncode == 3, stderr
+        assert "SIGKILL" in stderr
+        assert "step" in stderr
+        assert "Traceback" not in stderr
+    assert read_run(folder).manifest["status"] == "failed"
+
+
+def test_a_killed_launcher_leaves_nothing_but_its_recording(session_name: str, tmp_path: Path) -> None:
+    """kill -9 of the launcher: the physics process ends by itself and removes the segments; the log is whole."""
+    folder = tmp_path / "run"
+    with flying(session_name, folder) as process:
+        physics = physics_pid(folder)
+        time.sleep(1.2)
+        process.kill()
+        process.wait()
+        wait_until(lambda: gone(physics))
+        wait_until(lambda: not [n for n in os.listdir("/dev/shm") if session_name in n])
+    run = read_run(folder)
+    assert run.manifest["status"] == "running"
+    assert len(run.records) >= 5
+    assert np.array_equal(run.records["step"], np.arange(len(run.records)))
+
+
+@pytest.mark.parametrize("which", ["launcher", "physics"])
+def test_a_paused_process_gives_the_same_flight(fly: Callable[..., Done], tmp_path: Path, which: str) -> None:
+    """SIGSTOP of either side for a second changes nothing in commands and poses."""
+    undisturbed = fly("--max-steps", "25", out="plain").report["trajectory_hash"]
+    folder = tmp_path / "run"
+    with flying(f"test-pause-{os.getpid()}-{which}", folder, "--max-steps", "25", "--json") as process:
+        pid = process.pid if which == "launcher" else physics_pid(folder)
+        os.kill(pid, signal.SIGSTOP)
+        time.sleep(1.0)
+        os.kill(pid, signal.SIGCONT)
+        stdout, stderr = process.communicate(timeout=DEADLINE)
+        assert process.returncode == 0, stderr
+    assert Done(0, stdout, stderr).report["trajectory_hash"] == undisturbed
+
+
+def test_a_peer_started_by_hand_is_waited_for_and_not_killed(
+    fly: Callable[..., Done], session_name: str
+) -> None:
+    """--connect flies with a server that somebody else started, and does not kill it."""
+    server = subprocess.Popen(
+        [sys.executable, "-m", "physics_server", f"shm:{session_name}", "--attach-timeout", "60"],
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+    )
+    try:
+        done = fly("--connect", f"shm:{session_name}", "--max-steps", "3")
+        assert done.status == 0, done.stderr
+        assert server.wait(DEADLINE) == 0  # it left by itself after the goodbye
+    finally:
+        server.kill()
+        server.communicate()
+
+
+def test_another_physics_command_is_started_with_the_rendezvous(fly: Callable[..., Done]) -> None:
+    """--server starts the given command with the rendezvous appended, and the run says what it is."""
+    done = fly("--server", f"{sys.executable} -m physics_server --engine null", "--max-steps", "3")
+    assert done.status == 0, done.stderr
+    assert "null" in done.stderr
+
+
+def test_a_server_that_dies_at_once_is_reported_with_its_last_words(fly: Callable[..., Done]) -> None:
+    """A peer that exits before it attaches ends the launch with status 3 and what it wrote to stderr."""
+    done = fly("--server", f"{sys.executable} -c \"import sys; sys.exit('no licence found')\"")
+    assert done.status == 3, done.stderr
+    assert "no licence found" in done.stderr
+    assert "code 1" in done.stderr

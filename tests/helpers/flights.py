@@ -1,0 +1,52 @@
+"""Running `cosim` as a user does: as a subprocess, with a deadline."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+DEADLINE = 90.0
+"""Seconds after which a subprocess of a test is given up: compiling may be part of it."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """How a command ended."""
+
+    status: int
+    stdout: str
+    stderr: str
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """The object that --json prints as the last line of stdout."""
+        return dict(json.loads(self.stdout.splitlines()[-1]))
+
+
+def command(*arguments: str) -> list[str]:
+    """The command line of `cosim` with these arguments."""
+    return [sys.executable, "-m", "cosim", *arguments]
+
+
+def environment() -> dict[str, str]:
+    """Our environment, with the project importable from wherever the command runs."""
+    return os.environ | {"PYTHONPATH": str(ROOT)}
+
+
+def run_cosim(*arguments: str, cwd: Path) -> Done:
+    """Run `cosim` to its end."""
+    done = subprocess.run(
+        command(*arguments), capture_output=True, text=True, cwd=cwd, env=environment(), timeout=DEADLINE
+    )
+    return Done(done.returncode, done.stdout, done.stderr)
+
+
+def leftovers(session: str) -> list[str]:
+    """Shared memory whose name contains that of the session."""
+    return [name for name in os.listdir("/dev/shm") if session in name]
