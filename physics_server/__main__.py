@@ -1,0 +1,85 @@
+"""The program `python -m physics_server RENDEZVOUS`: rigid bodies for the agent that offers a session.
+
+Exit status: 0 the agent said goodbye; 2 bad usage, or the engine is not there; 3 the agent, the protocol or
+the engine failed; 128 + n ended by signal n. stdout stays empty; an error is one line on stderr.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+from types import FrameType
+from typing import NoReturn
+
+from physics_server.errors import EngineError, PhysicsServerError
+from protocol.errors import ProtocolError
+from protocol.physics import serve
+from protocol.plant import Plant
+
+
+def main() -> int:
+    """Serve one session and return the exit status."""
+    arguments = _parser().parse_args()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _leave)
+    # Whatever an engine prints from C goes to stderr: stdout stays clean for whoever started this.
+    os.dup2(sys.stderr.fileno(), 1)
+    try:
+        plant = _plant(arguments.engine)
+    except EngineError as error:
+        return _say(error, 2)
+    try:
+        serve(arguments.rendezvous, plant, arguments.attach_timeout)
+    except (ProtocolError, PhysicsServerError) as error:
+        return _say(error, 3)
+    return 0
+
+
+def _plant(engine: str) -> Plant:
+    """Make the plant of this name; only the engine that is asked for is imported."""
+    if engine == "null":
+        from physics_server.null import NullPlant
+
+        return NullPlant()
+    from physics_server.bullet import BulletPlant
+
+    return BulletPlant()
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m physics_server",
+        description="Integrate rigid bodies for the agent that offers a session at RENDEZVOUS.",
+    )
+    parser.add_argument("rendezvous", metavar="RENDEZVOUS", help="shm:NAME or file:/path/stem")
+    parser.add_argument(
+        "--engine",
+        choices=("bullet", "null"),
+        default="bullet",
+        help="bullet: PyBullet (default); null: answers at once and moves nothing, for benchmarks",
+    )
+    parser.add_argument(
+        "--attach-timeout",
+        metavar="SECONDS",
+        type=float,
+        default=30.0,
+        help="how long to wait for the agent to offer the session (default 30)",
+    )
+    return parser
+
+
+def _say(error: Exception, status: int) -> int:
+    """Write one line that says what was wrong."""
+    sys.stderr.write(f"physics_server: {' '.join(str(error).split())}\n")
+    return status
+
+
+def _leave(number: int, frame: FrameType | None) -> NoReturn:
+    """End as the shell expects of a process that a signal ends, but by way of every `finally`."""
+    raise SystemExit(128 + number)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
