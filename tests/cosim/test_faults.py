@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flights import DEADLINE, ROOT, Done, command, environment
+from flights import DEADLINE, ROOT, Done, command, environment, leftovers
 
 from cosim.runs import read_run
 
@@ -116,7 +116,7 @@ def test_a_killed_launcher_leaves_nothing_but_its_recording(session_name: str, t
         process.kill()
         process.wait()
         wait_until(lambda: gone(physics))
-        wait_until(lambda: not [n for n in os.listdir("/dev/shm") if session_name in n])
+        wait_until(lambda: not leftovers(session_name))
     run = read_run(folder)
     assert run.manifest["status"] == "running"
     assert len(run.records) >= 5

@@ -42,11 +42,17 @@ def environment() -> dict[str, str]:
 def run_cosim(*arguments: str, cwd: Path) -> Done:
     """Run `cosim` to its end."""
     done = subprocess.run(
-        command(*arguments), capture_output=True, text=True, cwd=cwd, env=environment(), timeout=DEADLINE
+        command(*arguments),
+        check=False,
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        env=environment(),
+        timeout=DEADLINE,
     )
     return Done(done.returncode, done.stdout, done.stderr)
 
 
 def leftovers(session: str) -> list[str]:
     """Shared memory whose name contains that of the session."""
-    return [name for name in os.listdir("/dev/shm") if session in name]
+    return [path.name for path in Path("/dev/shm").iterdir() if session in path.name]
