@@ -1,0 +1,318 @@
+"""Memory that two processes share: named segments and mapped files behind one small class.
+
+The only importer of `multiprocessing.shared_memory`. A rendezvous is `shm:NAME` or `file:/absolute/stem`; either
+stands for two segments, `.cmd` and `.pose`. On Linux `shm:NAME` is seen by others as `/dev/shm/NAME.cmd`.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import mmap
+import os
+import platform
+import re
+import shutil
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import resource_tracker
+from multiprocessing.shared_memory import SharedMemory
+from pathlib import Path
+from typing import Final
+
+from protocol.errors import SessionError
+
+COMMAND_SUFFIX: Final = ".cmd"
+POSE_SUFFIX: Final = ".pose"
+
+_log = logging.getLogger("protocol")
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_SHM_FOLDER: Final = Path("/dev/shm")
+_NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+@dataclass(frozen=True)
+class Rendezvous:
+    """Where the two sides meet; `parse_rendezvous` makes one from its text."""
+
+    kind: str  # "shm" or "file"
+    stem: str  # name of the shared memory, or absolute path, both without suffix
+
+    def __str__(self) -> str:
+        return f"{self.kind}:{self.stem}"
+
+
+def parse_rendezvous(text: str) -> Rendezvous:
+    """Read `shm:NAME` or `file:/absolute/stem`.
+
+    Raises:
+        SessionError: the text is neither, or names what this system does not offer.
+    """
+    kind, _, stem = text.partition(":")
+    if kind == "shm":
+        if not _NAME.fullmatch(stem):
+            raise SessionError(
+                "rendezvous: expected shm:NAME with 1 to 64 letters, digits, dots, dashes or underscores, "
+                f"the first a letter or digit, found {text!r}"
+            )
+        if sys.platform != "win32" and not _SHM_FOLDER.is_dir():
+            raise SessionError(f"rendezvous {text!r}: this system has no {_SHM_FOLDER}; use file:/path/stem")
+        return Rendezvous(kind, stem)
+    if kind == "file":
+        path = Path(stem)
+        if not path.is_absolute() or not path.name:
+            raise SessionError(f"rendezvous: expected file: and an absolute path, found {text!r}")
+        if not path.parent.is_dir():
+            raise SessionError(f"rendezvous {text!r}: there is no folder {path.parent}; make it first")
+        return Rendezvous(kind, stem)
+    raise SessionError(f"rendezvous: expected shm:NAME or file:/path/stem, found {text!r}")
+
+
+class Segment:
+    """One mapped segment; made by `create_segment` and `open_segment`."""
+
+    def __init__(
+        self, name: str, view: memoryview, path: Path | None, descriptor: int, unmap: Callable[[], None]
+    ) -> None:
+        self.name = name
+        self.view = view
+        self.path = path
+        """Where the file system shows the segment; None for Windows' shared memory."""
+        self._descriptor = descriptor
+        self._unmap = unmap
+        self._lock: SharedMemory | None = None
+
+    def lock(self) -> bool:
+        """Claim the segment for its one writer, until this process closes it or dies; False where it is taken.
+
+        A record lock on byte 0 (fcntl; LockFile for files of Windows, a segment NAME.lock for its shared memory):
+        the system itself releases it, so that a dead owner leaves no claim behind.
+        """
+        if sys.platform == "win32":
+            return self._lock_windows()
+        import fcntl
+
+        try:
+            fcntl.lockf(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, 1)
+        except (BlockingIOError, PermissionError):  # EAGAIN or EACCES, as the system likes
+            return False
+        return True
+
+    if sys.platform == "win32":
+
+        def _lock_windows(self) -> bool:
+            import msvcrt
+
+            try:
+                if self.path is None:
+                    self._lock = SharedMemory(f"{self.name}.lock", create=True, size=1)
+                else:
+                    os.lseek(self._descriptor, 0, os.SEEK_SET)
+                    msvcrt.locking(self._descriptor, msvcrt.LK_NBLCK, 1)
+            except OSError:
+                return False
+            return True
+
+    def unlink(self) -> None:
+        """Remove the segment's name, unless it is gone already or stands for a newer segment."""
+        if self.path is None:  # Windows removes shared memory with its last user
+            return
+        try:
+            if os.path.samestat(os.fstat(self._descriptor), self.path.stat()):
+                self.path.unlink()
+        except FileNotFoundError:
+            pass
+        except PermissionError as error:  # Windows, while the other side still maps the file
+            _log.warning("%s stays behind: %s", self.path, error)
+
+    def close(self) -> None:
+        """Unmap; every view of it must have been released before. Idempotent."""
+        if self._descriptor == _CLOSED:
+            return
+        self.view.release()
+        self._unmap()
+        if self._lock is not None:
+            self._lock.close()
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+        self._descriptor = _CLOSED
+
+
+_NO_DESCRIPTOR: Final = -1
+_CLOSED: Final = -2
+
+
+@dataclass(frozen=True)
+class Segments:
+    """The two segments of a session."""
+
+    command: Segment
+    pose: Segment
+
+    def unlink(self) -> None:
+        """Remove both names."""
+        self.command.unlink()
+        self.pose.unlink()
+
+    def close(self) -> None:
+        """Unmap both."""
+        self.command.close()
+        self.pose.close()
+
+
+def create_segment(rendezvous: Rendezvous, suffix: str, size: int) -> Segment:
+    """Create a segment of `size` zero bytes, with its memory reserved.
+
+    Raises:
+        FileExistsError: there is one of this name.
+        SessionError: there is no room, or the folder cannot be written.
+    """
+    name = rendezvous.stem + suffix
+    try:
+        if rendezvous.kind == "file":
+            path = Path(name)
+            flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+            descriptor = os.open(path, flags, 0o600)
+            try:
+                _reserve(descriptor, size)
+            except BaseException:
+                os.close(descriptor)
+                path.unlink()
+                raise
+            return _map_file(name, path, descriptor, size)
+        segment = _wrap_shared(name, _shared_memory(name, create=True, size=size))
+        try:
+            if segment.path is not None:
+                _reserve(segment._descriptor, size)
+        except BaseException:
+            segment.unlink()
+            segment.close()
+            raise
+    except FileExistsError:
+        raise
+    except OSError as error:
+        raise SessionError(_why_not_created(name, rendezvous, size, error)) from error
+    return segment
+
+
+def open_segment(rendezvous: Rendezvous, suffix: str) -> Segment | None:
+    """Open a segment that another process created; None while it is not there or has no size yet.
+
+    Raises:
+        SessionError: it is there and may not be opened.
+    """
+    name = rendezvous.stem + suffix
+    try:
+        if rendezvous.kind == "file":
+            descriptor = os.open(name, os.O_RDWR | getattr(os, "O_BINARY", 0))
+            size = os.fstat(descriptor).st_size
+            if size == 0:
+                os.close(descriptor)
+                return None
+            return _map_file(name, Path(name), descriptor, size)
+        return _wrap_shared(name, _shared_memory(name))
+    except (FileNotFoundError, ValueError):  # ValueError: mmap of an empty segment, its creator is not so far
+        return None
+    except OSError as error:
+        raise SessionError(f"cannot open segment {name}: {error}") from error
+
+
+def _map_file(name: str, path: Path, descriptor: int, size: int) -> Segment:
+    mapping = mmap.mmap(descriptor, size)
+    return Segment(name, memoryview(mapping), path, descriptor, mapping.close)
+
+
+def _wrap_shared(name: str, shared: SharedMemory) -> Segment:
+    """Put shared memory behind a Segment; its file, where the system shows one, serves locks and reservation."""
+    assert shared.buf is not None  # it is None only after close()
+    view = memoryview(shared.buf)
+    if sys.platform == "win32":
+        return Segment(name, view, None, _NO_DESCRIPTOR, shared.close)
+    path = _SHM_FOLDER / name
+    try:
+        descriptor = os.open(path, os.O_RDWR)
+    except BaseException:
+        view.release()
+        shared.close()
+        raise
+    return Segment(name, view, path, descriptor, shared.close)
+
+
+def _shared_memory(name: str, *, create: bool = False, size: int = 0) -> SharedMemory:
+    if sys.version_info >= (3, 13):
+        return SharedMemory(name, create=create, size=size, track=False)
+    with _untracked():
+        return SharedMemory(name, create=create, size=size)
+
+
+_tracker_patch = threading.Lock()
+
+
+@contextmanager
+def _untracked() -> Iterator[None]:
+    """Keep shared memory out of multiprocessing's resource tracker, as `track=False` does from Python 3.13 on.
+
+    The tracker removes, when *any* Python process that attached ends, a segment that others still use. Both
+    sides unlink by rule here, whichever of them dies, and need no tracker.
+    """
+    with _tracker_patch:
+        register = resource_tracker.register
+        resource_tracker.register = lambda name, rtype: None
+        try:
+            yield
+        finally:
+            resource_tracker.register = register
+
+
+def _reserve(descriptor: int, size: int) -> None:
+    """Give a new segment its size and its memory at once, so that a full /dev/shm is an error and no bus error."""
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(descriptor, 0, size)
+    else:
+        os.write(descriptor, bytes(size))
+
+
+def _why_not_created(name: str, rendezvous: Rendezvous, size: int, error: OSError) -> str:
+    if error.errno not in _NO_ROOM:
+        return f"cannot create segment {name}: {error}"
+    folder = _SHM_FOLDER if rendezvous.kind == "shm" else Path(rendezvous.stem).parent
+    free = shutil.disk_usage(folder).free if folder.is_dir() else 0
+    advice = (
+        "enlarge it (docker run --shm-size) or use file:/path/stem"
+        if rendezvous.kind == "shm"
+        else "make room"
+    )
+    return f"no room for segment {name}: expected {size} free bytes in {folder}, found {free}; {advice}"
+
+
+def _find_fence() -> Callable[[], None] | None:
+    """Return what keeps the processor from reordering stores, or None where it keeps their order by itself.
+
+    Raises:
+        SessionError: the processor may reorder, and the system's libraries have no fence that Python can call.
+    """
+    if platform.machine().lower() in ("x86_64", "amd64", "i686", "i386", "x86"):
+        return None
+    import ctypes
+
+    sequentially_consistent = 5  # memory_order_seq_cst of C11
+    try:
+        library, name, arguments = (
+            ("libSystem.dylib", "OSMemoryBarrier", ())
+            if sys.platform == "darwin"
+            else ("libatomic.so.1", "atomic_thread_fence", (sequentially_consistent,))
+        )
+        function = getattr(ctypes.CDLL(library), name)
+    except (OSError, AttributeError) as error:
+        raise SessionError(
+            f"this processor ({platform.machine()}) reorders stores and needs a fence: expected {name} "
+            f"in {library}, found none; install libatomic"
+        ) from error
+    return lambda: function(*arguments)
+
+
+FENCE: Final = _find_fence()
+"""Called after a message's last word and before its doorbell, and after a doorbell was seen; None on x86."""
