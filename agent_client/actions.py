@@ -15,7 +15,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from agent_client.episodes import Records
 from agent_client.settings import Settings
 
 Floats = NDArray[np.float64]
@@ -54,21 +53,23 @@ def action_table(settings: Settings) -> ActionTable:
 
 
 @njit(cache=True)
-def decode(actions: Ints, episodes: Records, local: Floats, speed: Floats, commands: Floats) -> None:
+def decode(actions: Ints, frame: Floats, local: Floats, speed: Floats, commands: Floats) -> None:
     """Write the direction and the speed of each lane's action into the rows of a command block.
 
     Args:
         actions: (N,) action indices, each within the table.
-        episodes: (N,) records; `frame` is read.
+        frame: (N, 3, 3) local frames, rows f, u, r.
         local: (A, 3) directions of the table, local frame.
         speed: (A,) speeds of the table (m/s).
         commands: (N, 8) block of `protocol.plant.CommandBatch`; words 0 to 3 are written.
     """
     for i in range(actions.shape[0]):
-        a, frame = actions[i], episodes[i].frame
+        a = actions[i]
         norm = 0.0
         for c in range(3):
-            commands[i, c] = local[a, 0] * frame[0, c] + local[a, 1] * frame[1, c] + local[a, 2] * frame[2, c]
+            commands[i, c] = (
+                local[a, 0] * frame[i, 0, c] + local[a, 1] * frame[i, 1, c] + local[a, 2] * frame[i, 2, c]
+            )
             norm += commands[i, c] ** 2
         for c in range(3):
             commands[i, c] /= np.sqrt(norm)

@@ -21,16 +21,13 @@ Bools = NDArray[np.bool_]
 
 
 @njit(cache=True, error_model="numpy")
-def look(
-    lanes: Ints, episodes: Records, constants: Records, poses: Floats, targets: Floats, clear: Bools
-) -> None:
+def look(lanes: Ints, episodes: Records, constants: Records, targets: Floats, clear: Bools) -> None:
     """Where each drone's target is, and whether it is seen.
 
     Args:
         lanes: (K,) the lanes to compute.
-        episodes: (N,) records; `frame` is read, the `target_...` fields are written.
+        episodes: (N,) records; `position` and `frame` are read, the `target_...` fields are written.
         constants: (1,) record of the task's constants.
-        poses: (N, 16) block of `protocol.plant.PoseBatch`.
         targets: (N, 3) points of the axis, world frame (m).
         clear: (N,) whether the line of sight meets no wall.
     """
@@ -38,7 +35,9 @@ def look(
     for k in range(lanes.shape[0]):
         i = lanes[k]
         e = episodes[i]
-        x, y, z = targets[i, 0] - poses[i, 0], targets[i, 1] - poses[i, 1], targets[i, 2] - poses[i, 2]
+        x = targets[i, 0] - e.position[0]
+        y = targets[i, 1] - e.position[1]
+        z = targets[i, 2] - e.position[2]
         distance = math.sqrt(x * x + y * y + z * z)
         if distance > 0.0:
             x, y, z = x / distance, y / distance, z / distance

@@ -28,6 +28,7 @@ def episode_dtype(rays: int) -> np.dtype[np.void]:
     """The record of one episode, for LiDAR rings of `rays` rays; `agent_client.task.TaskStep` explains it."""
     return np.dtype(
         [
+            ("position", "f8", (3,)),
             ("frame", "f8", (3, 3)),
             ("arc_length", "f8"),
             ("axis_position", "f8", (3,)),
@@ -68,7 +69,6 @@ def episode_dtype(rays: int) -> np.dtype[np.void]:
             ("contact", "?"),
             ("target_visible", "?"),
             ("memory_available", "?"),
-            ("live", "?"),  # whether the episode was running when the step began
         ],
         align=True,
     )

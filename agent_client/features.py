@@ -112,7 +112,7 @@ def feature_mask(masked: Sequence[str]) -> Singles:
 
 @njit(cache=True, error_model="numpy")
 def compute_features(
-    lanes: Ints, episodes: Records, constants: Records, poses: Floats, mask: Singles, observation: Singles
+    lanes: Ints, episodes: Records, constants: Records, mask: Singles, observation: Singles
 ) -> None:
     """Write the observations of lanes.
 
@@ -120,7 +120,6 @@ def compute_features(
         lanes: (K,) the lanes to compute.
         episodes: (N,) records, complete but for the observation.
         constants: (1,) record of the task's constants.
-        poses: (N, 16) block of `protocol.plant.PoseBatch`.
         mask: (37,) from `feature_mask`.
         observation: (N, 37) output.
     """
@@ -136,7 +135,7 @@ def compute_features(
             for c in range(3):
                 component = e.frame[a, c]
                 o[9 + 3 * a + c] = component
-                offset += (poses[i, c] - e.axis_position[c]) * component
+                offset += (e.position[c] - e.axis_position[c]) * component
                 seen += e.target_direction[c] * component
                 kept += e.memory_direction[c] * component
             o[21 + a] = offset / e.radius

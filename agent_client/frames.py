@@ -13,17 +13,18 @@ Ints = NDArray[np.int64]
 
 
 @njit(cache=True, error_model="numpy")
-def local_frames(lanes: Ints, episodes: Records, poses: Floats) -> None:
-    """Set the frames of lanes from their quaternions: f = M[:, 0], u = M[:, 2], r = -M[:, 1].
+def take_poses(lanes: Ints, episodes: Records, poses: Floats) -> None:
+    """Take position, local frame (f = M[:, 0], u = M[:, 2], r = -M[:, 1]) and speed along f from poses.
 
     Args:
         lanes: (K,) the lanes to compute.
-        episodes: (N,) records; `frame` is written.
+        episodes: (N,) records; `position`, `frame`, `speed` and `speed_before` are written.
         poses: (N, 16) block of `protocol.plant.PoseBatch`.
     """
     for k in range(lanes.shape[0]):
         i = lanes[k]
-        frame = episodes[i].frame
+        e = episodes[i]
+        frame = e.frame
         x, y, z, w = poses[i, 3], poses[i, 4], poses[i, 5], poses[i, 6]
         s = 2.0 / (x * x + y * y + z * z + w * w)
         frame[0, 0] = 1.0 - s * (y * y + z * z)
@@ -35,31 +36,10 @@ def local_frames(lanes: Ints, episodes: Records, poses: Floats) -> None:
         frame[2, 0] = -s * (x * y - w * z)
         frame[2, 1] = -(1.0 - s * (x * x + z * z))
         frame[2, 2] = -s * (y * z + w * x)
-
-
-@njit(cache=True, error_model="numpy")
-def quaternions(frame: Floats, quaternion: Floats) -> None:
-    """Quaternions (N, 4), x y z w, body to world, w >= 0, of orthonormal local frames (N, 3, 3)."""
-    for i in range(frame.shape[0]):
-        # The rotation's columns are f, -r, u. The largest component is found first, so that no root of a
-        # small difference is taken (Shepperd's method).
-        m00, m10, m20 = frame[i, 0, 0], frame[i, 0, 1], frame[i, 0, 2]
-        m01, m11, m21 = -frame[i, 2, 0], -frame[i, 2, 1], -frame[i, 2, 2]
-        m02, m12, m22 = frame[i, 1, 0], frame[i, 1, 1], frame[i, 1, 2]
-        trace = m00 + m11 + m22
-        if trace >= m00 and trace >= m11 and trace >= m22:
-            x, y, z, w = m21 - m12, m02 - m20, m10 - m01, 1.0 + trace
-        elif m00 >= m11 and m00 >= m22:
-            x, y, z, w = 1.0 + m00 - m11 - m22, m01 + m10, m02 + m20, m21 - m12
-        elif m11 >= m22:
-            x, y, z, w = m01 + m10, 1.0 - m00 + m11 - m22, m12 + m21, m02 - m20
-        else:
-            x, y, z, w = m02 + m20, m12 + m21, 1.0 - m00 - m11 + m22, m10 - m01
-        norm = np.sqrt(x * x + y * y + z * z + w * w)
-        if w < 0.0:
-            norm = -norm
-        quaternion[i, 0], quaternion[i, 1] = x / norm, y / norm
-        quaternion[i, 2], quaternion[i, 3] = z / norm, w / norm
+        e.speed_before, e.speed = e.speed, 0.0
+        for c in range(3):
+            e.position[c] = poses[i, c]
+            e.speed += poses[i, 7 + c] * frame[0, c]
 
 
 def frames_along(directions: Floats) -> Floats:
@@ -73,4 +53,22 @@ def frames_along(directions: Floats) -> Floats:
     hint = np.where(steep, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
     right = np.cross(forward, hint)
     right /= np.linalg.norm(right, axis=1, keepdims=True)
-    return np.stack([forward, np.cross(right, forward), right], axis=1)
+    frames: Floats = np.stack([forward, np.cross(right, forward), right], axis=1)
+    return frames
+
+
+def quaternions(frame: Floats) -> Floats:
+    """Unit quaternions (N, 4), x y z w, body to world, w >= 0, of orthonormal local frames (N, 3, 3)."""
+    m = np.stack([frame[:, 0], -frame[:, 2], frame[:, 1]], axis=2)  # columns f, left, u
+    x2, y2, z2 = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
+    # 4 q q^T; its row of the largest diagonal element is q times a factor that is never small.
+    outer = np.empty((len(m), 4, 4))
+    outer[:, 0, 0], outer[:, 1, 1] = 1.0 + x2 - y2 - z2, 1.0 - x2 + y2 - z2
+    outer[:, 2, 2], outer[:, 3, 3] = 1.0 - x2 - y2 + z2, 1.0 + x2 + y2 + z2
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        outer[:, i, j] = outer[:, j, i] = m[:, i, j] + m[:, j, i]
+        outer[:, k, 3] = outer[:, 3, k] = m[:, j, i] - m[:, i, j]
+    largest = np.argmax(np.diagonal(outer, axis1=1, axis2=2), axis=1)
+    q: Floats = outer[np.arange(len(m)), largest]
+    q /= np.linalg.norm(q, axis=1, keepdims=True) * np.where(q[:, 3:4] < 0.0, -1.0, 1.0)
+    return q

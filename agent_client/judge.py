@@ -12,7 +12,6 @@ from agent_client.episodes import Records
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 
 class Outcome(IntEnum):
@@ -33,52 +32,47 @@ class Outcome(IntEnum):
 def place(
     lanes: Ints,
     episodes: Records,
-    poses: Floats,
     arc_length: Floats,
     position: Floats,
     tangent: Floats,
     radial_distance: Floats,
     radius: Floats,
-    inside: Bools,
     clearance: Floats,
     near: Floats,
     fresh: bool,
 ) -> None:
-    """Take over what the geometry found, and the velocity along the body.
+    """Take over what the geometry found.
 
     Args:
         lanes: (K,) the lanes to compute.
-        episodes: (N,) records; `frame` is read.
-        poses: (N, 16) block of `protocol.plant.PoseBatch`.
+        episodes: (N,) records.
         arc_length: (N,), with the next four the fields of `meshes.geometry.AxisPoints`.
         position: (N, 3).
         tangent: (N, 3).
         radial_distance: (N,).
         radius: (N,).
-        inside: (N,) whether the centre is inside the tube.
-        clearance: (N,) distance of the centre to the wall (m).
+        clearance: (N,) distance of the centre to the wall (m), negative outside of the tube.
         near: (N,) output: where the next search of the axis begins.
         fresh: whether an episode begins here, so that nothing came before.
     """
     for k in range(lanes.shape[0]):
         i = lanes[k]
         e = episodes[i]
-        speed = 0.0
         for c in range(3):
             e.axis_position[c], e.tangent[c] = position[i, c], tangent[i, c]
-            speed += poses[i, 7 + c] * e.frame[0, c]
-        e.speed_before = speed if fresh else e.speed
-        e.arc_before = arc_length[i] if fresh else e.arc_length
-        e.speed, e.arc_length, near[i] = speed, arc_length[i], arc_length[i]
+        if fresh:
+            e.speed_before, e.arc_before = e.speed, arc_length[i]
+        else:
+            e.arc_before = e.arc_length
+        e.arc_length, near[i] = arc_length[i], arc_length[i]
         e.radial_distance, e.radius = radial_distance[i], radius[i]
         e.progress = min(max(e.arc_length / e.length, 0.0), 1.0)
-        e.inside, e.clearance = inside[i], clearance[i]
-        if e.outcome == 0:
-            e.min_clearance = min(e.min_clearance, e.clearance)
+        e.inside, e.clearance = clearance[i] > 0.0, clearance[i]
+        e.min_clearance = min(e.min_clearance, e.clearance)
 
 
 @njit(cache=True)
-def judge(lanes: Ints, episodes: Records, constants: Records, poses: Floats, words: Ints) -> None:
+def judge(lanes: Ints, episodes: Records, constants: Records, words: Ints) -> None:
     """Count the step, decide how each episode stands after it, and renew its quality index.
 
     Several ends in one step rank collision, success, exit, timeout: a body that leaves through the wall has
@@ -90,20 +84,16 @@ def judge(lanes: Ints, episodes: Records, constants: Records, poses: Floats, wor
         lanes: (K,) the lanes to compute.
         episodes: (N,) records after perception.
         constants: (1,) record of the task's constants.
-        poses: (N, 16) block of `protocol.plant.PoseBatch`.
-        words: the same block as int64.
+        words: (N, 16) block of `protocol.plant.PoseBatch`, viewed as int64.
     """
     constant = constants[0]
     for k in range(lanes.shape[0]):
         i = lanes[k]
         e = episodes[i]
-        e.live = e.outcome == 0
-        if not e.live:
-            continue
         e.step += 1
         along, square = 0.0, 0.0
         for c in range(3):
-            offset = poses[i, c] - e.axis_position[c]
+            offset = e.position[c] - e.axis_position[c]
             along += offset * e.tangent[c]
             square += offset * offset
         at_end = e.arc_length >= e.length - 1e-9

@@ -39,7 +39,6 @@ def place_rays(
     lanes: Ints,
     episodes: Records,
     constants: Records,
-    poses: Floats,
     circle: Floats,
     origins: Floats,
     directions: Floats,
@@ -48,9 +47,8 @@ def place_rays(
 
     Args:
         lanes: (K,) the lanes to compute.
-        episodes: (N,) records; `frame` is read.
+        episodes: (N,) records; `position` and `frame` are read.
         constants: (1,) record of the task's constants.
-        poses: (N, 16) block of `protocol.plant.PoseBatch`.
         circle: (rays, 2) from `ring_circle`.
         origins: (N, 2 + 2 rays, 3) output, world frame (m).
         directions: (N, 2 + 2 rays, 3) output, unit vectors.
@@ -58,9 +56,9 @@ def place_rays(
     rays, offset = circle.shape[0], constants[0].lidar_offset
     for k in range(lanes.shape[0]):
         i = lanes[k]
-        frame = episodes[i].frame
+        frame, position = episodes[i].frame, episodes[i].position
         for c in range(3):
-            f, u, r, p = frame[0, c], frame[1, c], frame[2, c], poses[i, c]
+            f, u, r, p = frame[0, c], frame[1, c], frame[2, c], position[c]
             origins[i, 0, c], origins[i, 1, c] = p, p
             directions[i, 0, c], directions[i, 1, c] = f, -f
             front, rear = p + offset * f, p - offset * f

@@ -65,7 +65,7 @@ def choose_regimes(lanes: Ints, episodes: Records) -> None:
 
 @njit(cache=True)
 def score(lanes: Ints, episodes: Records, constants: Records) -> None:
-    """Reward of the step that led here; episodes that were over before it earn nothing.
+    """Reward of the step that led here.
 
     The terminal reward comes on top of the last step's terms (the paper leaves this open).
 
@@ -79,9 +79,6 @@ def score(lanes: Ints, episodes: Records, constants: Records) -> None:
         e = episodes[lanes[k]]
         terms = e.reward_terms
         terms[:] = 0.0
-        e.reward = 0.0
-        if not e.live:
-            continue
         g, imbalance = e.gain, abs(e.S_F - e.S_R)
         terms[1] = g * 0.6 * (1.0 - 0.4 * e.C_turn) * e.S_F
         terms[2] = g * 0.4 * (1.0 + 0.4 * e.C_turn) * e.S_R

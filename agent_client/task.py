@@ -18,7 +18,7 @@ from agent_client.camera import look, remember
 from agent_client.episodes import OnContact, Records, constants, episode_dtype
 from agent_client.errors import SettingsError
 from agent_client.features import FEATURES, compute_features, feature_mask
-from agent_client.frames import local_frames
+from agent_client.frames import take_poses
 from agent_client.judge import Outcome, judge, place
 from agent_client.lidar import SPOKES, place_rays, read_rings, ring_circle, ring_sectors
 from agent_client.reward import Regime, choose_regimes, score
@@ -53,11 +53,15 @@ class TaskStep:
     regime: Bytes  # (N,)
     """Values of Regime."""
     outcome: Bytes  # (N,)
-    """Values of Outcome; stays as it is once an episode is over, until `begin`."""
+    """Values of Outcome. Once an episode is over its row stays as it is until `begin`, reward apart."""
     step: Ints  # (N,)
-    """Control steps of the episode; stops when it is over."""
+    """Control steps of the episode."""
     max_steps: Ints  # (N,)
     """Control steps after which it times out."""
+    position: Floats  # (N, 3)
+    """Centre of the drone (m)."""
+    speed: Floats  # (N,)
+    """Velocity along f (m/s)."""
     frame: Floats  # (N, 3, 3)
     """Local frame: rows f, u, r."""
     axis: AxisPoints
@@ -189,28 +193,33 @@ class TubeTask:
             active = np.zeros(self.lanes, dtype=np.bool_)
             active[lanes] = True
         self._perceive(lanes, poses, active, fresh=True)
-        self._describe(lanes, poses)
+        self._describe(lanes)
         return self._step
 
     def observe(self, poses: PoseBatch) -> TaskStep:
         """Take in the poses that answer a control step: perception, ends, rewards and observations.
 
-        Lanes whose episode is over keep their outcome and counters and earn nothing.
+        Lanes whose episode is over stay as they were at its end, but earn nothing more.
         """
-        lanes, episodes = self._all, self._episodes
-        self._perceive(lanes, poses, None, fresh=False)
-        judge(lanes, episodes, self._constants, poses.raw, poses.raw.view(np.int64))
+        lanes, active, episodes = self._all, None, self._episodes
+        running = self._step.outcome == Outcome.RUNNING
+        if not running.all():
+            lanes, active = np.flatnonzero(running), running
+            episodes["reward"][~running] = 0.0
+            episodes["reward_terms"][~running] = 0.0
+        self._perceive(lanes, poses, active, fresh=False)
+        judge(lanes, episodes, self._constants, poses.raw.view(np.int64))
         score(lanes, episodes, self._constants)
-        self._describe(lanes, poses)
+        self._describe(lanes)
         return self._step
 
     def _perceive(self, lanes: Ints, poses: PoseBatch, active: Bools | None, *, fresh: bool) -> None:
         """Sense: local frame, place in the tube, LiDAR, camera, memory and regime of `lanes`."""
-        geometry, episodes, constant, raw = self.geometry, self._episodes, self._constants, poses.raw
+        geometry, episodes, constant = self.geometry, self._episodes, self._constants
         position = self._position
         np.copyto(position, poses.position)  # contiguous, so that compiled queries see one layout
-        local_frames(lanes, episodes, raw)
-        place_rays(lanes, episodes, constant, raw, self._circle, self._origins, self._directions)
+        take_poses(lanes, episodes, poses.raw)
+        place_rays(lanes, episodes, constant, self._circle, self._origins, self._directions)
         axis = geometry.project(position, self._near)
         np.add(axis.arc_length, self.settings.camera.target_distance, out=self._ahead)
         targets, _ = geometry.axis(self._ahead)
@@ -218,18 +227,16 @@ class TubeTask:
         distances = geometry.rays(self._origins, self._directions, self.settings.lidar.reach, active)
         clear = geometry.visible(position, targets)
         self.ray_nanoseconds = time.perf_counter_ns() - started
-        inside, clearance = geometry.inside(position, axis), geometry.clearance(position, axis)
+        clearance = geometry.clearance(position, axis)
         place(
-            lanes, episodes, raw, axis.arc_length, axis.position, axis.tangent, axis.radial_distance,
-            axis.radius, inside, clearance, self._near, fresh,
+            lanes, episodes, axis.arc_length, axis.position, axis.tangent, axis.radial_distance,
+            axis.radius, clearance, self._near, fresh,
         )  # fmt: skip
         read_rings(lanes, episodes, constant, distances, self._sectors)
-        look(lanes, episodes, constant, raw, targets, clear)
+        look(lanes, episodes, constant, targets, clear)
         remember(lanes, episodes, constant)
         choose_regimes(lanes, episodes)
 
-    def _describe(self, lanes: Ints, poses: PoseBatch) -> None:
+    def _describe(self, lanes: Ints) -> None:
         """Write the observations of `lanes`."""
-        compute_features(
-            lanes, self._episodes, self._constants, poses.raw, self._mask, self._step.observation
-        )
+        compute_features(lanes, self._episodes, self._constants, self._mask, self._step.observation)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from meshes.geometry import AxisPoints, Bools, Floats, Geometry
 from protocol.plant import PoseBatch
@@ -15,8 +15,8 @@ from protocol.plant import PoseBatch
 class CylinderGeometry(Geometry):
     """Straight open tubes along world x from the origin, lane i of radius `radius[i]`; closed forms in numpy.
 
-    `wall_at` puts an opaque sheet across the tube at that x, which blocks sight but no LiDAR ray: it stands for
-    whatever may come between a camera and its target.
+    `wall_at` puts an opaque sheet across the tube at that x, which blocks sight but no LiDAR ray: it stands
+    for whatever may come between a camera and its target.
     """
 
     def __init__(self, lanes: int = 1, radius: float = 1.0, length: float = 20.0) -> None:
@@ -55,28 +55,24 @@ class CylinderGeometry(Geometry):
 
     def visible(self, points: Floats, targets: Floats) -> Bools:
         """A cylinder is convex: only the sheet at `wall_at` is ever in the way."""
-        return (
-            (points[:, 0] - self.wall_at) * (targets[:, 0] - self.wall_at) > 0.0
-            if np.isfinite(self.wall_at)
-            else np.ones(self.lanes, dtype=np.bool_)
-        )
+        seen: Bools = (points[:, 0] < self.wall_at) == (targets[:, 0] < self.wall_at)
+        return seen
 
     def inside(self, points: Floats, axis_points: AxisPoints) -> Bools:
         """Within the radius and between the end planes."""
-        radial = np.linalg.norm(points[:, 1:], axis=1)
-        return (radial < self.radius) & (points[:, 0] >= 0.0) & (points[:, 0] <= self._length)
+        return self.clearance(points, axis_points) > 0.0
 
     def clearance(self, points: Floats, axis_points: AxisPoints) -> Floats:
-        """Radius less the distance from the axis."""
-        return self.radius - np.linalg.norm(points[:, 1:], axis=1)
+        """Radius less the distance from the axis; beyond an end, the negative distance to its rim."""
+        deep = self.radius - np.linalg.norm(points[:, 1:], axis=1)
+        beyond = points[:, 0] - np.clip(points[:, 0], 0.0, self._length)
+        return np.where(beyond == 0.0, deep, -np.hypot(beyond, deep))
 
 
 def poses_at(
     position: object, direction: object = (1.0, 0.0, 0.0), speed: float = 0.0, roll: float = 0.0
 ) -> PoseBatch:
-    """Poses (N,) that look along `direction`, level but for `roll` (rad) about it, moving ahead at `speed`."""
-    from scipy.spatial.transform import Rotation
-
+    """Poses (N,) that look along `direction`, level but for `roll` (rad), and move ahead at `speed` (m/s)."""
     p = np.atleast_2d(np.asarray(position, dtype=np.float64))
     f = np.broadcast_to(np.asarray(direction, dtype=np.float64), p.shape)
     f = f / np.linalg.norm(f, axis=1, keepdims=True)
@@ -100,9 +96,3 @@ def cylinder() -> Callable[..., CylinderGeometry]:
 def poses_at_fixture() -> Callable[..., PoseBatch]:
     """Maker of poses."""
     return poses_at
-
-
-def random_rotations(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-    """Uniform random unit quaternions (count, 4)."""
-    q = rng.normal(size=(count, 4))
-    return q / np.linalg.norm(q, axis=1, keepdims=True)
