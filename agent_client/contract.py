@@ -11,7 +11,7 @@ import json
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,6 @@ from agent_client.features import FEATURE_NAMES
 from agent_client.settings import DEFAULT_DT, Settings
 
 CONTRACT_VERSION: Final = 1
-
-Scalar: TypeAlias = bool | int | float | str | None
 
 COMPARED: Final = ("drone", "lidar", "camera", "memory", "task.time_factor", "task.safety_scale")
 """Settings that change what a policy sees or does: whole groups, or single ones. The action table stands for
@@ -81,7 +79,7 @@ class Contract:
     network: Network
     settings: Mapping[str, Mapping[str, Any]]
     """All settings by group and name, as in `agent_client.settings`; `COMPARED` says which must agree."""
-    training: Mapping[str, Scalar] = field(default_factory=dict)
+    training: Mapping[str, Any] = field(default_factory=dict)
     """What the policy was trained with: preset, seed, steps, dynamics, versions. Recorded, never compared."""
     version: int = CONTRACT_VERSION
 
@@ -92,7 +90,7 @@ def running_contract(
     *,
     normalisation: Normalisation | None = None,
     network: Network | None = None,
-    training: Mapping[str, Scalar] | None = None,
+    training: Mapping[str, Any] | None = None,
 ) -> Contract:
     """The contract of what runs (or of what is trained) under these settings and this control step (s)."""
     settings = settings or Settings()
@@ -108,7 +106,7 @@ def running_contract(
         normalisation=normalisation or Normalisation.identity(len(FEATURE_NAMES)),
         network=network or Network((), "tanh"),
         settings=tree,
-        training=training or {},
+        training=json.loads(json.dumps(training or {})),
     )
 
 
