@@ -108,7 +108,6 @@ class PhysicsSession:
         self._lane_tubes = np.full(lanes, NO_TUBE)
         self._was_reset = np.zeros(lanes, dtype=bool)
         self._all_reset = False
-        self._one_lane = lanes == 1
 
         # Private copies of what is on the wire: a plant never sees words that may change under it.
         self._commands, self._poses = CommandBatch.zeros(lanes), PoseBatch.zeros(lanes)
@@ -120,6 +119,7 @@ class PhysicsSession:
         description = plant.describe()
         plant.open(lanes, settings.dt, settings.physics_dt, settings.inner_steps)
         self._speed_max = description.speed_max
+        self._commands_are_sound = validation.command_check(self._commands, self._speed_max)
         pid = os.getpid()
         handshake.write_answer(pose, self.offer, Answer(description, pid, start_time(pid)))
         self._state = follow(State.OFFERED, Event.ATTACH)
@@ -180,11 +180,7 @@ class PhysicsSession:
         if not self._all_reset:
             lane = int(np.argmin(self._was_reset))
             raise Refusal("step", "a lane that was reset", "a lane never reset", lane, RefusalCode.NOT_RESET)
-        if self._one_lane:
-            sound = validation.one_command_is_sound(self._command_bytes, self._speed_max)
-        else:
-            sound = validation.commands_are_sound(self._commands, self._speed_max)
-        if not sound:
+        if not self._commands_are_sound():
             refusal = validation.command_refusal(self._commands, self._speed_max)
             if refusal is not None:
                 raise refusal

@@ -41,36 +41,37 @@ class Parameter:
     either: tuple[float, ...] = ()
     """The values that are taken, where it is one of a few."""
 
+    @property
+    def range(self) -> str:
+        """The values that are taken, in words."""
+        if self.either:
+            return " or ".join(f"{value:g}" for value in self.either)
+        if self.highest < math.inf:
+            return f"{self.lowest:g} to {self.highest:g}"
+        if self.lowest > -math.inf:
+            return f"{'>' if self.above_lowest else '>='} {self.lowest:g}"
+        return "finite"
+
 
 PARAMETERS: Final[tuple[Parameter, ...]] = (
-    Parameter("mass", "kg", "mass m, > 0", 0.0, above_lowest=True),
-    Parameter("inertia_x", "kg m^2", "principal moment about the body's x axis, > 0", 0.0, above_lowest=True),
-    Parameter("inertia_y", "kg m^2", "principal moment about the body's y axis, > 0", 0.0, above_lowest=True),
-    Parameter("inertia_z", "kg m^2", "principal moment about the body's z axis, > 0", 0.0, above_lowest=True),
-    Parameter("body_radius", "m", "radius of the collision sphere, > 0", 0.0, above_lowest=True),
-    Parameter("force_gain", "1/s", "k_v of the force law, >= 0", 0.0),
-    Parameter(
-        "force_along_body",
-        "1",
-        "0: force along the commanded direction; 1: along the body's x axis",
-        either=(0.0, 1.0),
-    ),
-    Parameter("torque_kp", "1/s^2", "k_p of the torque law, per unit of inertia, >= 0", 0.0),
-    Parameter("torque_kd", "1/s", "k_d of the torque law, per unit of inertia, >= 0", 0.0),
-    Parameter("linear_drag", "N s/m", "force -drag * V, >= 0", 0.0),
-    Parameter("angular_drag", "N m s", "torque -drag * omega, >= 0", 0.0),
-    Parameter("gravity", "m/s^2", "acceleration g of gravity along world -Z, applied by the engine"),
-    Parameter("restitution", "1", "coefficient of restitution of body and wall, 0 to 1", 0.0, 1.0),
-    Parameter("friction", "1", "coefficient of friction of body and wall, >= 0", 0.0),
+    Parameter("mass", "kg", "mass m", 0.0, above_lowest=True),
+    Parameter("inertia_x", "kg m^2", "principal moment Ix about the body's x axis", 0.0, above_lowest=True),
+    Parameter("inertia_y", "kg m^2", "principal moment Iy about the body's y axis", 0.0, above_lowest=True),
+    Parameter("inertia_z", "kg m^2", "principal moment Iz about the body's z axis", 0.0, above_lowest=True),
+    Parameter("body_radius", "m", "radius of the collision sphere", 0.0, above_lowest=True),
+    Parameter("force_gain", "1/s", "k_v of the force law", 0.0),
+    Parameter("force_along_body", "1", "0: force along d; 1: along the body's x axis", either=(0.0, 1.0)),
+    Parameter("torque_kp", "1/s^2", "k_p of the torque law, per unit of inertia", 0.0),
+    Parameter("torque_kd", "1/s", "k_d of the torque law, per unit of inertia", 0.0),
+    Parameter("linear_drag", "N s/m", "force -drag * V", 0.0),
+    Parameter("angular_drag", "N m s", "torque -drag * omega", 0.0),
+    Parameter("gravity", "m/s^2", "acceleration g along world -Z, applied by the engine"),
+    Parameter("restitution", "1", "coefficient of restitution of body and wall", 0.0, 1.0),
+    Parameter("friction", "1", "coefficient of friction of body and wall", 0.0),
     Parameter("disturbance_x", "N", "constant force on the body, world frame"),
     Parameter("disturbance_y", "N", "constant force on the body, world frame"),
     Parameter("disturbance_z", "N", "constant force on the body, world frame"),
-    Parameter(
-        "gust",
-        "N",
-        "amplitude of a random force, constant over a control step, from the lane's seed, >= 0",
-        0.0,
-    ),
+    Parameter("gust", "N", "amplitude of a random force from the lane's seed, new every control step", 0.0),
 )
 """The parameters in the order of their words in a reset row; the words up to `PARAMETER_SLOTS` are reserved."""
 

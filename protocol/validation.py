@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Container
+from collections.abc import Callable, Container
 from typing import Final
 
 import numpy as np
 
 from protocol.errors import Refusal, RefusalCode
 from protocol.layout import COMMAND_STRIDE
-from protocol.plant import NO_TUBE, PARAMETERS, CommandBatch, Parameter, ResetBatch
+from protocol.plant import NO_TUBE, PARAMETERS, CommandBatch, Floats, Parameter, ResetBatch
 
 UNIT_TOLERANCE: Final = 1e-6
 """How far the squared length of a direction or a quaternion may be from 1."""
@@ -22,6 +22,29 @@ COMPENSATION_MAX: Final = 2.0
 
 _ROW: Final = struct.Struct("<5d3q")
 assert _ROW.size == COMMAND_STRIDE
+
+
+def command_check(commands: CommandBatch, speed_max: float) -> Callable[[], bool]:
+    """Make the quick check of a session's one batch of commands: whether all of it may be integrated.
+
+    A single lane is checked on scalars, which takes a twentieth of the time that arrays of one row take.
+    """
+    if len(commands.raw) == 1:
+        row = commands.raw.data.cast("B")
+        return lambda: one_command_is_sound(row, speed_max)
+    direction, reserved = commands.direction, commands.raw.view(np.int64)[:, 5:]
+    checked = np.empty((len(commands.raw), 3))
+    squared_length, speed_and_compensation = checked[:, 0], checked[:, 1:]
+    lowest = np.array([1.0 - UNIT_TOLERANCE, 0.0, 0.0])
+    highest = np.array([1.0 + UNIT_TOLERANCE, speed_max, COMPENSATION_MAX])
+
+    def all_are_sound() -> bool:
+        np.einsum("ij,ij->i", direction, direction, out=squared_length)
+        speed_and_compensation[...] = commands.raw[:, 3:5]
+        in_range = (checked >= lowest) & (checked <= highest)
+        return bool(in_range.all()) and not np.count_nonzero(reserved)
+
+    return all_are_sound
 
 
 def one_command_is_sound(row: memoryview, speed_max: float) -> bool:
@@ -35,28 +58,16 @@ def one_command_is_sound(row: memoryview, speed_max: float) -> bool:
     )
 
 
-def commands_are_sound(commands: CommandBatch, speed_max: float) -> bool:
-    """Whether all command rows may be integrated."""
-    d, speed, compensation = commands.direction, commands.speed, commands.compensation
-    with np.errstate(over="ignore", invalid="ignore"):
-        unit = np.abs(np.einsum("ij,ij->i", d, d) - 1.0) <= UNIT_TOLERANCE
-    in_range = (
-        (speed >= 0.0) & (speed <= speed_max) & (compensation >= 0.0) & (compensation <= COMPENSATION_MAX)
-    )
-    return bool((unit & in_range).all()) and not commands.raw.view(np.int64)[:, 5:].any()
-
-
 def command_refusal(commands: CommandBatch, speed_max: float) -> Refusal | None:
     """Return what is wrong with the first unsound command."""
     for lane, row in enumerate(commands.raw):
-        if one_command_is_sound(memoryview(row.tobytes()), speed_max):
+        if one_command_is_sound(row.data.cast("B"), speed_max):
             continue
-        x, y, z, speed, compensation = row[:5].tolist()
         return (
-            _unit(f"direction={_list(row[:3])}", (x, y, z), lane)
-            or _range("speed", speed, 0.0, speed_max, lane)
-            or _range("compensation", compensation, 0.0, COMPENSATION_MAX, lane)
-            or Refusal("reserved command word", "0", _list(row[5:]), lane, RefusalCode.RESERVED)
+            _unit("direction", row[:3], lane)
+            or _range("speed", float(row[3]), 0.0, speed_max, lane)
+            or _range("compensation", float(row[4]), 0.0, COMPENSATION_MAX, lane)
+            or _reserved("reserved command words", row[5:], lane)
         )
     return None
 
@@ -76,14 +87,12 @@ def _reset_row_refusal(resets: ResetBatch, lane: int, tubes: Container[int]) -> 
     for name in ("position", "quaternion", "linear_velocity", "angular_velocity"):
         values = getattr(resets, name)[lane]
         if not np.isfinite(values).all():
-            return Refusal(name, "finite numbers", _list(values), lane, RefusalCode.NOT_FINITE)
-    quaternion = resets.quaternion[lane].tolist()
+            return Refusal(name, "finite numbers", str(values.tolist()), lane, RefusalCode.NOT_FINITE)
     tube = int(resets.tube[lane])
     if tube != NO_TUBE and tube not in tubes:
-        return Refusal(
-            "tube", f"a registered tube's index, or {NO_TUBE}", str(tube), lane, RefusalCode.UNKNOWN_TUBE
-        )
-    return _unit(f"quaternion={quaternion}", quaternion, lane) or _parameters_refusal(resets, lane)
+        expected = f"a registered tube's index, or {NO_TUBE}"
+        return Refusal("tube", expected, str(tube), lane, RefusalCode.UNKNOWN_TUBE)
+    return _unit("quaternion", resets.quaternion[lane], lane) or _parameters_refusal(resets, lane)
 
 
 def _parameters_refusal(resets: ResetBatch, lane: int) -> Refusal | None:
@@ -92,30 +101,31 @@ def _parameters_refusal(resets: ResetBatch, lane: int) -> Refusal | None:
         refusal = _parameter_refusal(parameter, value, lane)
         if refusal is not None:
             return refusal
-    if values.view(np.int64)[len(PARAMETERS) :].any():
-        return Refusal(
-            "reserved parameter word", "0", _list(values[len(PARAMETERS) :]), lane, RefusalCode.RESERVED
-        )
-    return None
+    return _reserved("reserved parameter words", values[len(PARAMETERS) :], lane)
 
 
 def _parameter_refusal(parameter: Parameter, value: float, lane: int) -> Refusal | None:
-    if parameter.either and value not in parameter.either:
-        choices = " or ".join(f"{choice:g}" for choice in parameter.either)
-        return Refusal(parameter.name, choices, repr(value), lane, RefusalCode.OUT_OF_RANGE)
-    if parameter.above_lowest and value == parameter.lowest:
-        return Refusal(parameter.name, f"> {parameter.lowest:g}", repr(value), lane, RefusalCode.OUT_OF_RANGE)
-    return _range(parameter.name, value, parameter.lowest, parameter.highest, lane)
+    if not math.isfinite(value):
+        return Refusal(parameter.name, "a finite number", repr(value), lane, RefusalCode.NOT_FINITE)
+    taken = (
+        value in parameter.either
+        if parameter.either
+        else parameter.lowest <= value <= parameter.highest
+        and not (parameter.above_lowest and value == parameter.lowest)
+    )
+    if not taken:
+        return Refusal(parameter.name, parameter.range, repr(value), lane, RefusalCode.OUT_OF_RANGE)
+    return None
 
 
-def _unit(what: str, values: tuple[float, ...] | list[float], lane: int) -> Refusal | None:
-    name, _, shown = what.partition("=")
-    if not all(map(math.isfinite, values)):
-        return Refusal(name, "finite numbers", shown, lane, RefusalCode.NOT_FINITE)
-    squared = sum(value * value for value in values)
+def _unit(name: str, values: Floats, lane: int) -> Refusal | None:
+    if not np.isfinite(values).all():
+        return Refusal(name, "finite numbers", str(values.tolist()), lane, RefusalCode.NOT_FINITE)
+    squared = float(np.einsum("i,i->", values, values))
     if not abs(squared - 1.0) <= UNIT_TOLERANCE:
-        found = f"{shown} of squared length {squared:.9g}"
-        return Refusal(name, f"squared length 1 within {UNIT_TOLERANCE:g}", found, lane, RefusalCode.NOT_UNIT)
+        expected = f"squared length 1 within {UNIT_TOLERANCE:g}"
+        found = f"{values.tolist()} of squared length {squared:.9g}"
+        return Refusal(name, expected, found, lane, RefusalCode.NOT_UNIT)
     return None
 
 
@@ -127,5 +137,8 @@ def _range(name: str, value: float, lowest: float, highest: float, lane: int) ->
     return None
 
 
-def _list(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
-    return str(values.tolist())
+def _reserved(name: str, values: Floats, lane: int) -> Refusal | None:
+    words = values.view(np.int64)
+    if not words.any():
+        return None
+    return Refusal(name, "zero", f"integers {words.tolist()}", lane, RefusalCode.RESERVED)
