@@ -53,7 +53,8 @@ def resample(points: Floats, longest_step: float) -> tuple[Floats, Floats]:
     """
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     length = along[-1]
-    count = max(int(np.ceil(length / longest_step)), 4)
+    # A length that is a whole number of steps but for rounding must not gain another step.
+    count = max(int(np.ceil(length / longest_step - 1e-6)), 4)
     arc_length = np.linspace(0.0, length, count + 1)
     axis = np.stack([np.interp(arc_length, along, points[:, i]) for i in range(3)], axis=1)
 

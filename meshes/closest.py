@@ -41,8 +41,8 @@ def _morton(points: Floats) -> NDArray[np.uint64]:
     """Codes (F,) that order points (F, 3) along a curve on which neighbours stay close."""
     low = points.min(axis=0)
     # One scale for all axes, so that the cells of the curve are cubes.
-    scale = (2**_BITS - 1) / max(float((points.max(axis=0) - low).max()), np.finfo(np.float64).tiny)
-    cells = ((points - low) * scale).astype(np.uint64)
+    extent = (points.max(axis=0) - low).max() or 1.0
+    cells = ((points - low) / extent * (2**_BITS - 1)).astype(np.uint64)
     codes = np.zeros(len(points), dtype=np.uint64)
     for bit in range(_BITS):
         for axis in range(3):

@@ -45,10 +45,10 @@ class RayScene:
         hits = self._scene.run(
             (origins - self.centre).astype(np.float32),
             directions.astype(np.float32),
-            dists=reach,
+            dists=reach * (1 + 1e-6),
             query="DISTANCE",
         )
-        # The limit went through float32: without this a miss could read a little more than the reach.
+        # The limit goes through float32: a little more of it, then cut, and a miss reads the reach exactly.
         return np.minimum(hits, reach, dtype=np.float64)  # type: ignore[no-any-return]
 
     def blocked(self, origins: Floats, targets: Floats) -> Bools:

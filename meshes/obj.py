@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -210,37 +211,38 @@ def _elements(
     flat = [word.partition("/")[0] for line in words for word in line]
     try:
         corners = np.array(flat, dtype=np.int64) if flat else np.empty(0, np.int64)
-    except ValueError:
+    except (ValueError, OverflowError):
         corners = np.zeros(len(flat), np.int64)  # refused below: no reference is 0
     numbers = np.array(lines.numbers, dtype=np.int64)
     known = np.repeat(np.searchsorted(vertex_lines.numbers, numbers), sizes)
     corners = np.where(corners < 0, known + corners, corners - 1)
     if np.any(sizes < least) or np.any(corners < 0) or np.any(corners >= vertices):
-        return _refuse_elements(lines, words, vertices, least, path)
+        _refuse_elements(lines, words, vertex_lines, vertices, least, path)
     owners = np.searchsorted(name_lines, numbers, side="right") - 1
     return _Elements(corners, sizes, owners)
 
 
 def _refuse_elements(
-    lines: _Lines, words: list[list[str]], vertices: int, least: int, path: Path
-) -> _Elements:
+    lines: _Lines, words: list[list[str]], vertex_lines: _Lines, vertices: int, least: int, path: Path
+) -> NoReturn:
     """Raise for the first line that is wrong; called only where one is."""
     keyword = "f" if least == 3 else "l"
     for number, line in zip(lines.numbers, words, strict=True):
-        wrong = next((word for word in line if not _REFERENCE.fullmatch(word)), None)
         where = f"{path}, line {number}"
-        if wrong is not None:
-            raise MeshReadError(f"{where}: expected vertex numbers after {keyword!r}, found {wrong!r}")
         if len(line) < least:
             raise MeshReadError(
                 f"{where}: expected at least {least} vertices after {keyword!r}, found {len(line)}"
             )
+        known = int(np.searchsorted(vertex_lines.numbers, number))
         for word in line:
+            if not _REFERENCE.fullmatch(word):
+                raise MeshReadError(f"{where}: expected vertex numbers after {keyword!r}, found {word!r}")
             index = int(word.partition("/")[0])
-            if index == 0 or abs(index) > vertices:
-                raise MeshReadError(f"{where}: expected a vertex from 1 to {vertices}, found {index}")
-    # What is left: a negative number that counts back past the first vertex before its own line.
-    raise MeshReadError(f"{path}: a negative vertex number counts back past the first vertex")
+            if index == 0 or index > vertices or index < -known:
+                raise MeshReadError(
+                    f"{where}: expected a vertex from 1 to {vertices}, or from -{known} to -1, found {index}"
+                )
+    raise MeshReadError(f"{path}: expected vertex numbers after {keyword!r}, found what cannot be read")
 
 
 def _triangles(faces: _Elements, places: NDArray[np.int64]) -> tuple[Ints, Ints, int]:

@@ -242,15 +242,13 @@ def _local_radius(tube: Tube) -> Floats:
     wrong = (hits < LEAST_HITS) | crossed
     if wrong.any():
         i = int(np.argmax(wrong))
-        found = (
-            f"{RING - hits[i]} of {RING} rays around it that meet no wall"
-            if hits[i] < LEAST_HITS
-            else "the wall crossed by it"
-        )
+        found = f"{RING - hits[i]} of {RING} rays around it that meet no wall"
+        if crossed[i]:
+            found += " and the wall crossed by it"
         raise CentrelineError(
             f"{tube.centreline_path}: expected a centreline inside of the tube {tube.path.name}, found at "
-            f"arc length {tube.arc_length[i]:.2f} m of {tube.length:.2f} m {found}, and {wrong.sum()} such "
-            f"points of {len(wrong)}; check that both files have the same axes and unit"
+            f"arc length {tube.arc_length[i]:.2f} m of {tube.length:.2f} m {found}; "
+            f"{wrong.sum()} of {len(wrong)} points are wrong: check that both files have the same axes and unit"
         )
     return np.where(hit, distances, 0.0).sum(axis=1) / hits  # type: ignore[no-any-return]
 

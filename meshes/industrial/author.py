@@ -7,8 +7,8 @@ Run it with Blender's Python module, which is needed for this and for nothing el
 
 The files go beside this script unless a folder is named, and are byte-identical from run to run.
 
-The conduit is a steel pipe of about 2 m in diameter: straight runs and elbows in all three dimensions, one run
-a vertical rise, a reducer, an expander, weld beads where runs and elbows meet, flanges with bolts, and posts
+The conduit is a steel pipe of about 2 m in diameter: straight runs and elbows in all three dimensions, one
+run a vertical rise, a reducer, an expander, weld beads where runs and elbows meet, flanges with bolts, and posts
 down to the ground. Inside there is nothing but the wall and its weld beads. World frame: Z up, metres.
 """
 
@@ -180,7 +180,7 @@ def guide_curve(name: str, route: list[Station], resolution: int) -> bpy.types.O
 
 
 def to_mesh(thing: bpy.types.Object) -> None:
-    """Convert in place, with bevel and modifiers: a bevelled curve exported as it is would be written twice."""
+    """Convert in place, with bevel and modifiers: a bevelled curve that is exported is written twice."""
     select([thing])
     bpy.ops.object.convert(target="MESH")
 
