@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import agent_client
 from agent_client.contract import require_match, running_contract
-from agent_client.controllers import Controller, PolicyController, PurePursuit
-from agent_client.policy import Policy, load_policy
+from agent_client.controllers import DEFAULT_LOOKAHEAD, Controller, PolicyController, PurePursuit
+from agent_client.policy import load_policy
 from agent_client.settings import DEFAULT_DT, Settings
 from cosim.errors import CosimError
 from cosim.options import SHIPPED_MESH, SHIPPED_POLICY, FlightOptions
@@ -47,13 +47,57 @@ def read_tube_input(options: FlightOptions) -> tuple[Tube, tuple[str, ...]]:
     return tube, notes
 
 
-def read_pilot(options: FlightOptions, tube: Tube, geometry: MeshGeometry) -> Pilot:
+def read_pilot(options: FlightOptions, geometry: MeshGeometry) -> Pilot:
     """The controller that the options name, checked against what will run.
 
     Raises:
         AgentError: a checkpoint that cannot be read, or whose contract differs from what would run.
+        CosimError: an option that this controller does not have.
     """
-    raise NotImplementedError
+    base = Settings()
+    if options.compensation is not None:
+        base = replace(base, drone=replace(base.drone, compensation=options.compensation))
+    if options.policy == PURE_PURSUIT:
+        lookahead = DEFAULT_LOOKAHEAD if options.lookahead is None else options.lookahead
+        pursuit = PurePursuit(geometry, base, lookahead=lookahead)
+        return Pilot(
+            pursuit,
+            base,
+            DEFAULT_DT if options.dt is None else options.dt,
+            {
+                "name": PURE_PURSUIT,
+                "lookahead": lookahead,
+                "speed": pursuit.speed,
+                "sees": "exact centreline",
+            },
+            (),
+        )
+    if options.lookahead is not None:
+        raise CosimError("--lookahead: only --policy pure-pursuit has one")
+    path, notes = _shipped(options.policy, SHIPPED_POLICY, SHIPPED_CHECKPOINT, "policy")
+    policy = load_policy(path)
+    contract = policy.contract
+    settings = replace(base, masked_features=contract.masked)
+    dt = contract.dt if options.dt is None else options.dt
+    allowed = set(options.allow_mismatch)
+    if options.compensation is not None:
+        allowed.add("drone.compensation")  # naming a value is allowing it
+    mismatch = require_match(contract, running_contract(settings, dt), str(path), allowed)
+    for difference in mismatch:
+        notes += (
+            f"policy: {difference.name} differs: made for {difference.expected}, flown with {difference.found}",
+        )
+    description = {
+        "name": path.stem,
+        "path": str(path),
+        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "sees": f"{len(contract.observations) - len(contract.masked)} features, no centreline"
+        if contract.masked
+        else f"{len(contract.observations)} features",
+        "training": dict(contract.training),
+        "mismatch": [asdict(difference) for difference in mismatch],
+    }
+    return Pilot(PolicyController(policy, settings), settings, dt, description, (*policy.notes, *notes))
 
 
 def parse_parameters(pairs: tuple[str, ...]) -> dict[str, float]:

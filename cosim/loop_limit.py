@@ -6,6 +6,7 @@ hence the same states. It is the yardstick of the whole control loop.
 
 from __future__ import annotations
 
+import itertools
 import time
 from typing import Any, Final
 
@@ -98,9 +99,7 @@ def rays_microseconds(tube: Tube, records: NDArray[np.void], rays: int, reach: f
     mesh = embree.TriangleMesh(scene, (tube.wall.vertices - centre).astype(np.float32), tube.wall.faces)
     angle = np.linspace(0.0, 2.0 * np.pi, rays, endpoint=False)
     directions = np.stack([np.zeros(rays), np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
-    origins = [
-        np.tile((row["position"] - centre).astype(np.float32), (rays, 1)) for row in records[1:]
-    ]
+    origins = [np.tile((row["position"] - centre).astype(np.float32), (rays, 1)) for row in records[1:]]
     started = time.perf_counter()
     for at in origins:
         scene.run(at, directions, dists=reach, query="DISTANCE")
@@ -114,7 +113,7 @@ def network_microseconds(records: NDArray[np.void], sizes: tuple[int, ...]) -> f
     rng = np.random.default_rng(0)
     layers = [
         (rng.standard_normal((n, m)).astype(np.float32) / n, np.zeros(m, np.float32))
-        for n, m in zip(sizes, sizes[1:], strict=False)
+        for n, m in itertools.pairwise(sizes)
     ]
     observations = [np.array(row["observation"]) for row in records[1:]]
     started = time.perf_counter()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -25,6 +26,10 @@ def physics_command(server: str | None) -> list[str]:
     words = shlex.split(server)
     if not words:
         raise PeerCommandError("--server: expected a command, found an empty string")
+    if shutil.which(words[0]) is None:
+        raise PeerCommandError(
+            f"--server: expected a program that can be run, found {words[0]!r}, which cannot"
+        )
     return words
 
 

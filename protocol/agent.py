@@ -83,6 +83,8 @@ class AgentSession:
         """Control steps integrated in this session."""
         self.description: PlantDescription
         """What the physics side says of itself."""
+        self.peer_pid: int
+        """Process id of the physics side."""
         self._number = 0
         self._engine_ns = 0
         self._on_close = on_close
@@ -153,7 +155,8 @@ class AgentSession:
         Raises:
             HandshakeError: its header is not what this version expects, or does not echo ours.
         """
-        self.description = handshake.read_answer(self._pose, self._offer).description
+        answer = handshake.read_answer(self._pose, self._offer)
+        self.description, self.peer_pid = answer.description, answer.pid
         self._wait = wait
         self._state = follow(self._state, Event.ATTACH)
 
