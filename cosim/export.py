@@ -68,11 +68,8 @@ def _write_csv(run: Run, target: Path) -> None:
 
 def _write_npz(run: Run, target: Path) -> None:
     with target.open("wb") as file:
-        np.savez(
-            file,
-            manifest=np.array(json.dumps(run.manifest)),
-            **{c.name: run.records[c.name] for c in run.columns},
-        )
+        arrays: dict[str, Any] = {c.name: run.records[c.name] for c in run.columns}
+        np.savez(file, manifest=np.array(json.dumps(run.manifest)), **arrays)
 
 
 def _write_parquet(run: Run, target: Path) -> None:

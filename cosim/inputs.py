@@ -83,10 +83,10 @@ def read_pilot(options: FlightOptions, geometry: MeshGeometry) -> Pilot:
     if options.compensation is not None:
         allowed.add("drone.compensation")  # naming a value is allowing it
     mismatch = require_match(contract, running_contract(settings, dt), str(path), allowed)
-    for difference in mismatch:
-        notes += (
-            f"policy: {difference.name} differs: made for {difference.expected}, flown with {difference.found}",
-        )
+    notes += tuple(
+        f"policy: {difference.name}: made for {difference.expected}, flown with {difference.found}"
+        for difference in mismatch
+    )
     description = {
         "name": path.stem,
         "path": str(path),

@@ -31,7 +31,7 @@ def physics_microseconds(tube: Tube, records: NDArray[np.void], inner_steps: int
         inner_steps: of one control step.
         dt: control step (s).
     """
-    p = bullet.pybullet
+    p: Any = bullet.pybullet  # type: ignore[attr-defined]  # its one importer
     client = p.connect(p.DIRECT)
     try:
         p.setPhysicsEngineParameter(
@@ -94,9 +94,10 @@ def _inner_steps(
 
 def rays_microseconds(tube: Tube, records: NDArray[np.void], rays: int, reach: float) -> float:
     """Mean time of one call of Embree with as many rays as the LiDAR has, from the flight's positions."""
-    scene = embree.EmbreeScene(robust=True)
+    scene = embree.EmbreeScene(robust=True)  # type: ignore[attr-defined]  # its one importer
     centre = tube.wall.vertices.mean(axis=0)
-    mesh = embree.TriangleMesh(scene, (tube.wall.vertices - centre).astype(np.float32), tube.wall.faces)
+    vertices = (tube.wall.vertices - centre).astype(np.float32)
+    mesh = embree.TriangleMesh(scene, vertices, tube.wall.faces)  # type: ignore[attr-defined]
     angle = np.linspace(0.0, 2.0 * np.pi, rays, endpoint=False)
     directions = np.stack([np.zeros(rays), np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
     origins = [np.tile((row["position"] - centre).astype(np.float32), (rays, 1)) for row in records[1:]]

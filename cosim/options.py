@@ -45,7 +45,7 @@ class FlightOptions:
     attach_timeout: float = DEFAULT_ATTACH_SECONDS
 
 
-class Fraction(click.ParamType):
+class Fraction(click.ParamType[float]):
     """A positive number of seconds, also as a fraction such as 1/240."""
 
     name = "seconds"
