@@ -31,7 +31,7 @@ def sweep_wall(tube: SweptTube, sides: int = 48) -> tuple[Floats, NDArray[np.int
     if sides < MIN_SIDES:
         raise MeshError(f"sides: expected at least {MIN_SIDES} but found {sides}")
     angles = 2.0 * np.pi * np.arange(sides) / sides
-    # The mean distance of a polygon with corners at 1 is cos(h) / h * asinh(tan(h)), h half of a side's angle.
+    # A polygon with corners at 1 has the mean distance cos(h) / h * asinh(tan(h)), h half of a side's angle.
     half = np.pi / sides
     distance = tube.section(angles) * half / (np.cos(half) * np.arcsinh(np.tan(half)))  # (M, sides)
     binormals = np.cross(tube.tangents, tube.normals)
@@ -49,7 +49,7 @@ def sweep_wall(tube: SweptTube, sides: int = 48) -> tuple[Floats, NDArray[np.int
 
 
 def write_obj(path: Path | str, vertices: Floats, faces: NDArray[np.int32]) -> None:
-    """Writes vertices (V, 3) and triangles (F, 3) as .obj, in metres, Z up, with 9 digits; OSError where it cannot."""
+    """Writes vertices (V, 3) and triangles (F, 3) as .obj, in metres, Z up, with 9 digits."""
     _write(Path(path), vertices, "f %d %d %d\n", faces)
 
 

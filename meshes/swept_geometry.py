@@ -7,6 +7,7 @@ are open: a ray that leaves through an end meets no wall, as with a mesh without
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,11 +17,7 @@ from meshes.errors import MeshError
 from meshes.geometry import AxisPoints, Bools, Floats, Geometry
 from meshes.swept import SweptTube, segment_curvature
 from meshes.swept_kernels import (
-    BEFORE_START,
-    NOT_BEYOND,
-    WINDOW,
-    Integers,
-    Pool,
+    Swept,
     axis_point,
     axis_tangent,
     cast,
@@ -29,9 +26,38 @@ from meshes.swept_kernels import (
     place,
     plane_gap,
     settle,
-    settle_anywhere,
     wall_distance,
 )
+
+Integers = NDArray[np.int64]
+
+WINDOW = 2.0
+"""How far from the arc length that is given the nearest axis point is searched (m)."""
+
+
+class Pool(NamedTuple):
+    """Tubes packed one behind the other, see `Swept`; tube t owns rows[t] rows from first[t] on."""
+
+    axis: Floats  # (ΣM, 8)
+    normals: Floats  # (ΣM, 3)
+    harmonics: Floats  # (ΣM, H, 2)
+    first: Integers  # (T,)
+    rows: Integers  # (T,)
+    step: Floats  # (T,)
+    uniform: Bools  # (T,)
+    swing: Floats  # (T,)
+    ripple: Floats  # (T,)
+    slope: Floats  # (T,)
+
+
+class AxisRows(NamedTuple):
+    """The arrays of `AxisPoints`, in a form that compiled code takes."""
+
+    arc_length: Floats
+    position: Floats
+    tangent: Floats
+    radial_distance: Floats
+    radius: Floats
 
 
 class SweptGeometry(Geometry):
@@ -54,7 +80,7 @@ class SweptGeometry(Geometry):
         self._capacity = self._pool.rows.copy()
         self.assigned: Integers = np.arange(lanes, dtype=np.int64) % len(tubes)
         self._all = np.ones(lanes, dtype=np.bool_)
-        self._row: Integers = self._pool.first[self.assigned].copy()
+        self._row: Integers = np.zeros(lanes, dtype=np.int64)
 
     def assign(self, lanes: ArrayLike, tube_indices: ArrayLike) -> None:
         """Puts the lanes (K,) into the tubes (K,) of the pool.
@@ -68,7 +94,7 @@ class SweptGeometry(Geometry):
             raise MeshError(f"tube_indices: expected 0 to {size - 1} but found {indices.tolist()}")
         chosen = np.asarray(lanes, dtype=np.int64)
         self.assigned[chosen] = indices
-        self._row[chosen] = self._pool.first[indices]
+        self._row[chosen] = 0
 
     def replace(self, slots: Sequence[int], tubes: Sequence[SweptTube]) -> None:
         """Refills slots of the pool; lanes that fly in them must begin a new episode.
@@ -87,8 +113,7 @@ class SweptGeometry(Geometry):
                     f"{tube.harmonics.shape[1]}; make the pool from tubes at least as long"
                 )
             _store(self._pool, slot, tube)
-            lanes = self.assigned == slot
-            self._row[lanes] = self._pool.first[slot]
+            self._row[self.assigned == slot] = 0
 
     @property
     def length(self) -> Floats:
@@ -105,13 +130,11 @@ class SweptGeometry(Geometry):
 
     def project(self, points: Floats, near: Floats | None = None) -> AxisPoints:
         """See `Geometry.project`."""
-        found = AxisPoints(*(np.empty(shape) for shape in _axis_shapes(self.lanes)))
-        guess = np.full(self.lanes, np.nan) if near is None else near
-        _project(
-            self._pool, self.assigned, self._row, points, guess,
-            found.arc_length, found.position, found.tangent, found.radial_distance, found.radius,
-        )  # fmt: skip
-        return found
+        n = self.lanes
+        found = AxisRows(np.empty(n), np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n))
+        guess = np.full(n, np.nan) if near is None else near
+        _project(self._pool, self.assigned, self._row, points, guess, found)
+        return AxisPoints(*found)
 
     def axis(self, arc_length: Floats) -> tuple[Floats, Floats]:
         """See `Geometry.axis`."""
@@ -139,10 +162,6 @@ class SweptGeometry(Geometry):
         gaps = np.empty(self.lanes)
         _clearance(self._pool, self.assigned, points, axis_points.arc_length, axis_points.position, gaps)
         return gaps
-
-
-def _axis_shapes(lanes: int) -> tuple[tuple[int, ...], ...]:
-    return (lanes,), (lanes, 3), (lanes, 3), (lanes,), (lanes,)
 
 
 def _pack(tubes: Sequence[SweptTube]) -> Pool:
@@ -193,6 +212,23 @@ def _store(pool: Pool, slot: int, tube: SweptTube) -> None:
 
 
 @compiled
+def _tube(pool: Pool, slot: int) -> Swept:
+    """The tube in a slot, as views into the pool."""
+    start = pool.first[slot]
+    stop = start + pool.rows[slot]
+    return Swept(
+        pool.axis[start:stop],
+        pool.normals[start:stop],
+        pool.harmonics[start:stop],
+        pool.step[slot],
+        pool.uniform[slot],
+        pool.swing[slot],
+        pool.ripple[slot],
+        pool.slope[slot],
+    )
+
+
+@compiled
 def _rays(
     pool: Pool,
     assigned: Integers,
@@ -206,51 +242,53 @@ def _rays(
     for lane in range(origins.shape[0]):
         if not active[lane]:
             continue
-        tube, row = assigned[lane], rows[lane]
+        tube, row = _tube(pool, assigned[lane]), rows[lane]
         for k in range(origins.shape[1]):
             x, y, z = origins[lane, k, 0], origins[lane, k, 1], origins[lane, k, 2]
             dx, dy, dz = directions[lane, k, 0], directions[lane, k, 1], directions[lane, k, 2]
-            out[lane, k], row = cast(pool, tube, row, x, y, z, dx, dy, dz, reach)
+            out[lane, k], row = cast(tube, row, x, y, z, dx, dy, dz, reach)
 
 
 @compiled
 def _project(
-    pool: Pool, assigned: Integers, rows: Integers, points: Floats, near: Floats,
-    arc: Floats, position: Floats, tangent: Floats, radial: Floats, radius: Floats,
-) -> None:  # fmt: skip
+    pool: Pool,
+    assigned: Integers,
+    rows: Integers,
+    points: Floats,
+    near: Floats,
+    found: AxisRows,
+) -> None:
     for lane in range(points.shape[0]):
-        tube = assigned[lane]
+        tube = _tube(pool, assigned[lane])
+        axis, step, last = tube.axis, tube.step, len(tube.axis) - 1
         x, y, z = points[lane, 0], points[lane, 1], points[lane, 2]
-        first, step = pool.first[tube], pool.step[tube]
-        last = first + pool.rows[tube] - 1
-        if np.isnan(near[lane]):
-            row, u, _ = settle_anywhere(pool, tube, x, y, z)
-        else:
-            low = first + int(np.ceil(max(near[lane] - WINDOW, 0.0) / step))
-            high = first + int((near[lane] + WINDOW) / step)
-            low, high = min(low, last - 1), min(high, last)
-            row, u, _ = settle(pool, tube, low, max(high, low + 1), x, y, z)
+        low, high = 0, last
+        if not np.isnan(near[lane]):
+            low = min(int(np.ceil(max(near[lane] - WINDOW, 0.0) / step)), last - 1)
+            high = max(min(int((near[lane] + WINDOW) / step), last), low + 1)
+        row, u, _ = settle(axis, low, high, x, y, z)
         rows[lane] = row
-        qx, qy, qz = axis_point(pool, tube, row, u)
-        arc[lane] = (row - first + u) * step
-        position[lane, 0], position[lane, 1], position[lane, 2] = qx, qy, qz
-        tangent[lane, 0], tangent[lane, 1], tangent[lane, 2] = axis_tangent(pool, row, u)
-        radial[lane] = np.sqrt((x - qx) ** 2 + (y - qy) ** 2 + (z - qz) ** 2)
-        radius[lane] = mean_radius(pool, row, u)
+        qx, qy, qz = axis_point(axis, step, row, u)
+        found.arc_length[lane] = (row + u) * step
+        found.position[lane, 0], found.position[lane, 1], found.position[lane, 2] = qx, qy, qz
+        tx, ty, tz = axis_tangent(axis, row, u)
+        found.tangent[lane, 0], found.tangent[lane, 1], found.tangent[lane, 2] = tx, ty, tz
+        found.radial_distance[lane] = np.sqrt((x - qx) ** 2 + (y - qy) ** 2 + (z - qz) ** 2)
+        found.radius[lane] = mean_radius(axis, row, u)
 
 
 @compiled
 def _axis(pool: Pool, assigned: Integers, arc: Floats, position: Floats, tangent: Floats) -> None:
     for lane in range(arc.shape[0]):
-        tube = assigned[lane]
-        row, u = place(pool, tube, arc[lane])
-        position[lane, 0], position[lane, 1], position[lane, 2] = axis_point(pool, tube, row, u)
-        tangent[lane, 0], tangent[lane, 1], tangent[lane, 2] = axis_tangent(pool, row, u)
+        tube = _tube(pool, assigned[lane])
+        row, u = place(tube.axis, tube.step, arc[lane])
+        position[lane, 0], position[lane, 1], position[lane, 2] = axis_point(tube.axis, tube.step, row, u)
+        tangent[lane, 0], tangent[lane, 1], tangent[lane, 2] = axis_tangent(tube.axis, row, u)
 
 
 @compiled
 def _visible(
-    pool: Pool, assigned: Integers, rows: Integers, points: Floats, targets: Floats, out: NDArray[np.bool_]
+    pool: Pool, assigned: Integers, rows: Integers, points: Floats, targets: Floats, out: Bools
 ) -> None:
     for lane in range(points.shape[0]):
         x, y, z = points[lane, 0], points[lane, 1], points[lane, 2]
@@ -258,11 +296,9 @@ def _visible(
         reach = np.sqrt(dx * dx + dy * dy + dz * dz)
         out[lane] = True
         if reach > 0.0:
-            scale = 1.0 / reach
-            distance, _ = cast(
-                pool, assigned[lane], rows[lane], x, y, z, dx * scale, dy * scale, dz * scale, reach
-            )
-            out[lane] = distance >= reach
+            dx, dy, dz = dx / reach, dy / reach, dz / reach
+            tube = _tube(pool, assigned[lane])
+            out[lane] = cast(tube, rows[lane], x, y, z, dx, dy, dz, reach)[0] >= reach
 
 
 @compiled
@@ -270,30 +306,24 @@ def _clearance(
     pool: Pool, assigned: Integers, points: Floats, arc: Floats, foot: Floats, out: Floats
 ) -> None:
     for lane in range(points.shape[0]):
-        tube = assigned[lane]
+        tube = _tube(pool, assigned[lane])
+        axis = tube.axis
         x, y, z = points[lane, 0], points[lane, 1], points[lane, 2]
-        row, u = place(pool, tube, arc[lane])
+        row, u = place(axis, tube.step, arc[lane])
         vx, vy, vz = x - foot[lane, 0], y - foot[lane, 1], z - foot[lane, 2]
-        gap, beyond = 0.0, NOT_BEYOND
-        if arc[lane] <= 0.0:
-            gap = plane_gap(pool.axis, row, x, y, z)
-            beyond = BEFORE_START if gap < 0.0 else NOT_BEYOND
-        elif u == 1.0 and row == pool.first[tube] + pool.rows[tube] - 2:
-            gap = plane_gap(pool.axis, row + 1, x, y, z)
-            beyond = 1 if gap > 0.0 else NOT_BEYOND
-        if beyond != NOT_BEYOND:
-            end = row if beyond == BEFORE_START else row + 1
-            vx, vy, vz = (
-                vx - gap * pool.axis[end, 3],
-                vy - gap * pool.axis[end, 4],
-                vz - gap * pool.axis[end, 5],
-            )
-        radial = np.sqrt(vx * vx + vy * vy + vz * vz)
-        deep = wall_distance(pool, tube, row, u, vx, vy, vz) - radial
-        if beyond != NOT_BEYOND:
-            out[lane] = -np.sqrt(gap * gap + deep * deep)
-        elif pool.uniform[tube]:
+        ahead = 0.0  # distance beyond an end plane
+        if row == 0 and u <= 0.0:
+            ahead = min(plane_gap(axis, 0, x, y, z), 0.0)
+        elif row == len(axis) - 2 and u >= 1.0:
+            ahead = max(plane_gap(axis, row + 1, x, y, z), 0.0)
+        if ahead != 0.0:
+            tx, ty, tz = axis_tangent(axis, row, u)
+            vx, vy, vz = vx - ahead * tx, vy - ahead * ty, vz - ahead * tz
+        deep = wall_distance(tube, row, u, vx, vy, vz) - np.sqrt(vx * vx + vy * vy + vz * vz)
+        if ahead != 0.0:
+            out[lane] = -np.sqrt(ahead * ahead + deep * deep)
+        elif tube.uniform:
             out[lane] = deep
         else:
-            distance = nearest_wall(pool, tube, arc[lane], x, y, z)
+            distance = nearest_wall(tube, arc[lane], x, y, z)
             out[lane] = distance if deep >= 0.0 else -distance
