@@ -1,7 +1,8 @@
 """The program `python -m physics_server RENDEZVOUS`: rigid bodies for the agent that offers a session.
 
-Exit status: 0 the agent said goodbye; 2 bad usage, or the engine is not there; 3 the agent, the protocol or
-the engine failed; 128 + n ended by signal n. stdout stays empty; an error is one line on stderr.
+Exit status: 0 the agent said goodbye; 2 bad usage, a rendezvous that cannot be used, or the engine is not
+there; 3 the agent, the protocol or the engine failed; 128 + n ended by signal n. An error is one line on
+stderr; stdout stays empty.
 """
 
 from __future__ import annotations
@@ -14,15 +15,17 @@ from types import FrameType
 from typing import NoReturn
 
 from physics_server.errors import EngineError, PhysicsServerError
-from protocol.errors import ProtocolError
+from protocol.errors import ProtocolError, SessionError
 from protocol.physics import serve
 from protocol.plant import Plant
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def main() -> int:
     """Serve one session and return the exit status."""
     arguments = _parser().parse_args()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in _SIGNALS:
         signal.signal(number, _leave)
     # Whatever an engine prints from C goes to stderr: stdout stays clean for whoever started this.
     os.dup2(sys.stderr.fileno(), 1)
@@ -32,6 +35,8 @@ def main() -> int:
         return _say(error, 2)
     try:
         serve(arguments.rendezvous, plant, arguments.attach_timeout)
+    except SessionError as error:
+        return _say(error, 2)
     except (ProtocolError, PhysicsServerError) as error:
         return _say(error, 3)
     return 0
@@ -77,7 +82,9 @@ def _say(error: Exception, status: int) -> int:
 
 
 def _leave(number: int, frame: FrameType | None) -> NoReturn:
-    """End as the shell expects of a process that a signal ends, but by way of every `finally`."""
+    """End with the status that a shell gives to a signal, by way of every `finally`; a second one changes nothing."""
+    for each in _SIGNALS:
+        signal.signal(each, signal.SIG_IGN)
     raise SystemExit(128 + number)
 
 

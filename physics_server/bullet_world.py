@@ -76,9 +76,6 @@ drone that slides along a bend sinks into the wall."""
 RESTITUTION_SPEED: Final = 0.2
 """Speed of impact (m/s) below which a body does not bounce, so that it can come to rest; Bullet's default."""
 
-WALL_FLAGS: Final = pybullet.GEOM_FORCE_CONCAVE_TRIMESH
-"""Without it the engine takes the convex hull of the wall: a tube filled solid."""
-
 _DISTANCE: Final = 8
 """Index of the distance in what getContactPoints returns; negative where the body is inside of the wall."""
 
@@ -199,8 +196,8 @@ def _add_static(client: int, piece: Piece) -> None:
     shape = pybullet.createCollisionShape(
         pybullet.GEOM_MESH,
         vertices=piece.vertices,
-        indices=piece.indices,
-        flags=WALL_FLAGS,
+        indices=piece.indices,  # without them the engine takes the convex hull: a tube filled solid
+        flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
         physicsClientId=client,
     )
     wall = pybullet.createMultiBody(0.0, shape, physicsClientId=client)
@@ -226,7 +223,7 @@ def _add_body(client: int, body: BodyParameters) -> int:
         spinningFriction=0.0,
         linearDamping=0.0,
         angularDamping=0.0,
-        maxJointVelocity=1e9,  # Bullet would cut off every component of velocity at 100
+        maxJointVelocity=np.inf,  # Bullet would cut off every component of velocity at 100
         contactProcessingThreshold=0.0,  # a wall that is near but not yet touched must not slow the body down
         activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
         physicsClientId=client,

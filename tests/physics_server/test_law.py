@@ -1,0 +1,118 @@
+"""The force and torque law against the equations of the annex, written with matrices."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from physics_server.law import control_law, gust_force, splitmix64
+from physics_server.parameters import SPEED_MAX, BodyParameters
+from protocol.plant import PARAMETERS
+
+numbers = st.floats(-5, 5)
+gains = st.floats(0, 50)
+
+
+@st.composite
+def unit(draw: st.DrawFn, size: int) -> tuple[float, ...]:
+    """A random unit vector or quaternion."""
+    vector = np.array(draw(st.lists(st.floats(-1, 1), min_size=size, max_size=size)))
+    norm = np.linalg.norm(vector)
+    if norm < 0.1:
+        vector, norm = np.eye(size)[0], 1.0
+    return tuple((vector / norm).tolist())
+
+
+@st.composite
+def bodies(draw: st.DrawFn) -> BodyParameters:
+    """Random parameters, every term of the law present."""
+    row = [draw(st.floats(0.1, 3)) for _ in PARAMETERS]
+    body = BodyParameters.from_row(row)
+    return dataclasses.replace(body, force_along_body=draw(st.sampled_from([0.0, 1.0])))
+
+
+def rotation(quaternion: tuple[float, ...]) -> np.ndarray:
+    """Rotation matrix by Rodrigues' formula, another way than the law's."""
+    v, w = np.array(quaternion[:3]), quaternion[3]
+    K = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.eye(3) + 2 * w * K + 2 * K @ K
+
+
+vectors = st.tuples(numbers, numbers, numbers)
+
+
+@given(bodies(), unit(3), st.floats(0, SPEED_MAX), st.floats(0, 2), vectors, unit(4), vectors, vectors)
+def test_force_and_torque_are_the_equations(
+    body: BodyParameters,
+    direction: tuple[float, float, float],
+    speed: float,
+    compensation: float,
+    gust: tuple[float, float, float],
+    quaternion: tuple[float, float, float, float],
+    velocity: tuple[float, float, float],
+    omega: tuple[float, float, float],
+) -> None:
+    """Force and torque agree with the annex's equations in the world frame, with I rotated into the world."""
+    force, torque = control_law(body, direction, speed, compensation, gust)(quaternion, velocity, omega)
+
+    M = rotation(quaternion)
+    f, d, V, w = M[:, 0], np.array(direction), np.array(velocity), np.array(omega)
+    a = f if body.force_along_body else d
+    disturbance = np.array([body.disturbance_x, body.disturbance_y, body.disturbance_z])
+    lift = np.array([0, 0, compensation * body.mass * body.gravity])
+    F = body.mass * body.force_gain * (speed * a - V) + lift - body.linear_drag * V + disturbance + gust
+    inertia = M @ np.diag([body.inertia_x, body.inertia_y, body.inertia_z]) @ M.T
+    tau = inertia @ (body.torque_kp * np.cross(f, d) - body.torque_kd * w) - body.angular_drag * w
+    np.testing.assert_allclose(force, F, rtol=1e-12, atol=1e-11)
+    np.testing.assert_allclose(M @ torque, tau, rtol=1e-11, atol=1e-10)
+
+
+def test_compensation_tilts_neither_direction_nor_torque() -> None:
+    """Compensation adds weight along world z, and leaves the horizontal force and the torque bit for bit."""
+    state = (0.1, 0.2, 0.3, 0.9273618495495703), (0.3, -0.2, 0.1), (1.0, 2.0, 3.0)
+    body, direction = BodyParameters(), (0.6, 0.0, 0.8)
+    without, with_it = (control_law(body, direction, 1.0, c)(*state) for c in (0.0, 0.9))
+    assert with_it[0][:2] == without[0][:2]
+    assert with_it[0][2] - without[0][2] == pytest.approx(0.9 * 9.81, rel=1e-14)
+    assert with_it[1] == without[1]
+
+
+def test_zero_gains_and_compensation_command_nothing() -> None:
+    """With all gains zero and c = 0 a command is neither force nor torque, whatever it says."""
+    body = BodyParameters(force_gain=0.0, torque_kp=0.0, torque_kd=0.0)
+    law = control_law(body, (0.0, 0.6, 0.8), SPEED_MAX, 0.0)
+    force, torque = law((0.5, 0.5, 0.5, 0.5), (1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
+    assert force == (0.0, 0.0, 0.0)
+    assert torque == (0.0, 0.0, 0.0)
+
+
+def test_gusts_come_from_the_published_generator() -> None:
+    """The generator repeats the published outputs of SplitMix64 for the seed 1234567, state by state."""
+    golden = 0x9E3779B97F4A7C15
+    outputs = [splitmix64(1234567 + k * golden) for k in range(3)]
+    assert outputs == [6457827717110365317, 3203168211198807973, 9817491932198370423]
+
+
+def test_a_gust_depends_on_seed_and_step_alone() -> None:
+    """Components lie within the amplitude, repeat for the same seed and step, and no step shares another's."""
+    gusts = np.array([gust_force(2.0, 7, step) for step in range(1, 401)])
+    assert np.abs(gusts).max() <= 2.0
+    assert len(np.unique(gusts)) == gusts.size
+    assert gusts.mean() == pytest.approx(0.0, abs=0.15)
+    assert gusts.std() == pytest.approx(2 / np.sqrt(3), rel=0.05)
+    assert gust_force(2.0, 7, 400) == tuple(gusts[-1])
+    assert gust_force(2.0, -3, 1) == gust_force(2.0, 2**64 - 3, 1)
+    assert gust_force(0.0, 7, 1) == (0.0, 0.0, 0.0)
+
+
+def test_the_defaults_are_the_table_of_the_protocol() -> None:
+    """Names and order are the protocol's, and every default lies in its range."""
+    assert [field.name for field in dataclasses.fields(BodyParameters)] == [p.name for p in PARAMETERS]
+    for parameter, value in zip(PARAMETERS, BodyParameters().row(), strict=True):
+        assert parameter.lowest <= value <= parameter.highest, parameter.name
+        assert not (parameter.above_lowest and value == parameter.lowest), parameter.name
+        assert not parameter.either or value in parameter.either, parameter.name
