@@ -119,10 +119,11 @@ def fly(
     commands.compensation[:] = settings.drone.compensation
     clock = time.perf_counter_ns
     started = clock()
-    while not stopped and (running := state.outcome == Outcome.RUNNING).any():
+    while not stopped and (over := np.count_nonzero(state.outcome)) < geometry.lanes:
         begun = clock()
         controller.act(state, commands, actions)
-        commands.speed[~running] = 0.0
+        if over:
+            commands.speed[state.outcome != int(Outcome.RUNNING)] = 0.0
         decided = clock()
         poses = session.step(commands)
         answered = clock()

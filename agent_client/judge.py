@@ -96,10 +96,11 @@ def judge(lanes: Ints, episodes: Records, constants: Records, words: Ints) -> No
             offset = e.position[c] - e.axis_position[c]
             along += offset * e.tangent[c]
             square += offset * offset
-        at_end = e.arc_length >= e.length - 1e-9
-        through_end = at_end and along > 0.0 and square - along * along <= e.radius * e.radius
+        in_opening = square - along * along <= e.radius * e.radius
+        through_end = in_opening and along > 0.0 and e.arc_length >= e.length - 1e-9
+        through_start = in_opening and along < 0.0 and e.arc_length <= 1e-9
         near_end = e.length - e.arc_length <= constant.success_radius * e.radius
-        e.contact = words[i, 14] > 0 or (e.clearance < constant.touch and not through_end)
+        e.contact = words[i, 14] > 0 or (e.clearance < constant.touch and not (through_end or through_start))
         if e.contact:
             e.contacts += 1
         if e.contact and constant.end_on_contact > 0.0:

@@ -202,11 +202,11 @@ class TubeTask:
         Lanes whose episode is over stay as they were at its end, but earn nothing more.
         """
         lanes, active, episodes = self._all, None, self._episodes
-        running = self._step.outcome == Outcome.RUNNING
-        if not running.all():
-            lanes, active = np.flatnonzero(running), running
-            episodes["reward"][~running] = 0.0
-            episodes["reward_terms"][~running] = 0.0
+        if np.count_nonzero(self._step.outcome):
+            active = self._step.outcome == int(Outcome.RUNNING)
+            lanes = np.flatnonzero(active)
+            self._step.reward[~active] = 0.0
+            self._step.reward_terms[~active] = 0.0
         self._perceive(lanes, poses, active, fresh=False)
         judge(lanes, episodes, self._constants, poses.raw.view(np.int64))
         score(lanes, episodes, self._constants)

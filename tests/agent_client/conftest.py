@@ -69,6 +69,54 @@ class CylinderGeometry(Geometry):
         return np.where(beyond == 0.0, deep, -np.hypot(beyond, deep))
 
 
+class BendGeometry(Geometry):
+    """Circular bends in the plane z = 0 from the origin along +x, turning left; radius of the bend `bend` (m).
+
+    The LiDAR sees nothing and sight is never blocked: for tests of flight along an axis.
+    """
+
+    def __init__(self, lanes: int = 1, bend: float = 3.0, length: float = 9.0, radius: float = 1.0) -> None:
+        self.lanes = lanes
+        self.bend, self.radius = bend, radius
+        self._length: Floats = np.full(lanes, length)
+
+    @property
+    def length(self) -> Floats:
+        """Length of each lane's axis (m)."""
+        return self._length
+
+    def rays(self, origins: Floats, directions: Floats, reach: float, active: Bools | None = None) -> Floats:
+        """No echo."""
+        return np.full(origins.shape[:2], reach)
+
+    def project(self, points: Floats, near: Floats | None = None) -> AxisPoints:
+        """The polar angle about the bend's centre (0, bend, 0)."""
+        angle = np.arctan2(points[:, 0], self.bend - points[:, 1]) % (2.0 * np.pi)
+        s = np.clip(self.bend * angle, 0.0, self._length)
+        position, tangent = self.axis(s)
+        radial = np.linalg.norm(points - position, axis=1)
+        return AxisPoints(s, position, tangent, radial, np.full(self.lanes, self.radius))
+
+    def axis(self, arc_length: Floats) -> tuple[Floats, Floats]:
+        """Points and tangents of the circle."""
+        angle = np.clip(arc_length, 0.0, self._length) / self.bend
+        zero = np.zeros_like(angle)
+        position = np.stack([self.bend * np.sin(angle), self.bend * (1.0 - np.cos(angle)), zero], axis=1)
+        return position, np.stack([np.cos(angle), np.sin(angle), zero], axis=1)
+
+    def visible(self, points: Floats, targets: Floats) -> Bools:
+        """Always."""
+        return np.ones(self.lanes, dtype=np.bool_)
+
+    def inside(self, points: Floats, axis_points: AxisPoints) -> Bools:
+        """Within the radius."""
+        return self.clearance(points, axis_points) > 0.0
+
+    def clearance(self, points: Floats, axis_points: AxisPoints) -> Floats:
+        """Radius less the distance from the axis."""
+        return self.radius - axis_points.radial_distance
+
+
 def poses_at(
     position: object, direction: object = (1.0, 0.0, 0.0), speed: float = 0.0, roll: float = 0.0
 ) -> PoseBatch:
@@ -90,6 +138,12 @@ def poses_at(
 def cylinder() -> Callable[..., CylinderGeometry]:
     """Maker of straight tubes."""
     return CylinderGeometry
+
+
+@pytest.fixture
+def bend() -> Callable[..., BendGeometry]:
+    """Maker of circular bends."""
+    return BendGeometry
 
 
 @pytest.fixture(name="poses_at")
