@@ -63,21 +63,22 @@ def export(run: Path, kind: str, output: Path | None) -> None:
 
 
 @cosim.command(short_help="Train a policy with PPO in the kinematic world.")
+@click.option("--preset", type=click.Choice(["shipped", "paper"]), default="shipped", show_default=True)
 @click.option(
-    "--steps", type=click.IntRange(min=1), default=1_300_000, show_default=True, help="Control steps."
+    "--steps", type=click.IntRange(min=1), help="Control steps of all drones [default: the preset's]."
 )
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
 @click.option("--envs", type=click.IntRange(min=1), default=65, show_default=True, help="Drones at a time.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("runs/training"), show_default=True)
-def train(steps: int, seed: int, envs: int, out: Path) -> None:
+def train(preset: str, steps: int | None, seed: int, envs: int, out: Path) -> None:
     """Train a policy with PPO in the kinematic world, through the curriculum of the paper.
 
     \b
-    cosim train --steps 1300000 --seed 1 --out runs/mine
+    cosim train --preset shipped --seed 1 --out runs/mine
     """
     from cosim.train import train as run
 
-    run(steps, seed, envs, out)
+    run(preset, steps, seed, envs, out)
 
 
 @cosim.command(short_help="Measure round trip, control loop and start-up on this machine.")
