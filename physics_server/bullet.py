@@ -124,17 +124,18 @@ class BulletPlant(Plant):
     def _check_wall(self, lane: int, wall: RegisteredWall, position: Floats, quaternion: Floats) -> None:
         """Compare the engine's wall around a start with perception's, on a ring around the forward axis.
 
-        An engine may fill a hollow tube solid; then its rays do not find the wall that the sensors see. This
-        happens in a world of its own, so that a lane whose reset is refused has not been touched.
+        An engine may fill a hollow tube solid; then its rays do not find the wall that the sensors see. A lane
+        that comes from another tube is not touched before all is well: the wall is built in a spare world.
         """
-        if self._probe is None:
-            self._probe = World(self._physics_dt)
-        if self._probe.wall is not wall:
-            self._probe.build(wall)
+        world = self._lanes[lane].world
+        if world.wall is not wall:
+            world = self._probe = self._probe or World(self._physics_dt)
+            if world.wall is not wall:
+                world.build(wall)
         directions = ring_around(quaternion)
         origins = np.tile(position, (len(directions), 1))
         perception = np.median(wall.wall.scene.distances(origins, directions, wall.reach))
-        engine = np.median(self._probe.distances(origins, directions, wall.reach))
+        engine = np.median(world.distances(origins, directions, wall.reach))
         if abs(engine - perception) > AGREEMENT * perception:
             raise Refusal(
                 "wall",

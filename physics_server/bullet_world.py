@@ -76,6 +76,9 @@ drone that slides along a bend sinks into the wall."""
 RESTITUTION_SPEED: Final = 0.2
 """Speed of impact (m/s) below which a body does not bounce, so that it can come to rest; Bullet's default."""
 
+_STATIC: Final = 2
+"""Bullet's filter group of bodies that do not move."""
+
 _DISTANCE: Final = 8
 """Index of the distance in what getContactPoints returns; negative where the body is inside of the wall."""
 
@@ -100,6 +103,8 @@ class World:
         self.wall: RegisteredWall | None = None
         self._physics_dt = physics_dt
         self._client: int = pybullet.connect(pybullet.DIRECT)
+        if self._client < 0:
+            raise EngineError(f"{ENGINE}: expected a further world, found no room for one; use fewer lanes")
         self._body = -1
         self._pieces = 0
         self.build(None)
@@ -179,10 +184,10 @@ class World:
         return BodyState(position, quaternion, velocity, omega), touched
 
     def distances(self, origins: Floats, directions: Floats, reach: float) -> Floats:
-        """Distance (m) to the first surface along each ray (M, 3), at most `reach` (m), (M,)."""
+        """Distance (m) to the wall along each ray (M, 3), at most `reach` (m), (M,); the body is not seen."""
         ends = (origins + directions * reach).tolist()
         hits: Sequence[tuple[int, int, float]] = pybullet.rayTestBatch(
-            origins.tolist(), ends, physicsClientId=self._client
+            origins.tolist(), ends, collisionFilterMask=_STATIC, physicsClientId=self._client
         )
         return np.array([hit[2] * reach for hit in hits])
 

@@ -12,6 +12,8 @@ import pytest
 
 from protocol.errors import Refusal
 
+LIMP = {"force_gain": 0.0, "torque_kp": 0.0, "torque_kd": 0.0}
+"""No commanded force or torque."""
 START = {
     "position": (1.0, 0.2, -0.1),
     "quaternion": (0.1, -0.2, 0.3, np.sqrt(1 - 0.14)),
@@ -178,6 +180,17 @@ def test_an_unreadable_mesh_is_refused(
     reference = dataclasses.replace(tube_file(), path=str(path))
     with pytest.raises(Refusal, match=f"expected a readable mesh at {path}"):
         rig().plant.register_tube(0, reference)
+
+
+def test_the_wall_is_checked_past_the_drone_itself(
+    rig: Callable[..., Any], tube_file: Callable[..., Any]
+) -> None:
+    """A reset in the same tube, to where the drone stands or near it, sees the wall and not the drone."""
+    world = rig()
+    world.plant.register_tube(0, tube_file())
+    for offset in (0.0, 0.0, 0.1, 0.25):
+        world.reset(tube=0, position=(5, 0, offset), **LIMP)
+        assert not world.step()[0, 0, 10:13].any()
 
 
 def test_a_refused_reset_moves_no_lane(

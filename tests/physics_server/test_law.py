@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from physics_server.law import control_law, gust_force, splitmix64
@@ -45,6 +45,7 @@ def rotation(quaternion: tuple[float, ...]) -> np.ndarray:
 vectors = st.tuples(numbers, numbers, numbers)
 
 
+@settings(deadline=None)
 @given(bodies(), unit(3), st.floats(0, SPEED_MAX), st.floats(0, 2), vectors, unit(4), vectors, vectors)
 def test_force_and_torque_are_the_equations(
     body: BodyParameters,
