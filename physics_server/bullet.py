@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from meshes.geometry import Floats
-from physics_server.bullet_world import ENGINE, FACES_PER_PIECE, WORLDS_MAX, BodyState, World
+from physics_server.bullet_world import ENGINE, INDICES_MAX, VERTICES_MAX, WORLDS_MAX, BodyState, World
 from physics_server.errors import EngineError
 from physics_server.law import control_law, gust_force
 from physics_server.parameters import BodyParameters, description
@@ -72,7 +72,7 @@ class BulletPlant(Plant):
         Raises:
             Refusal: the file cannot be read as a mesh, or is not the one that the agent read.
         """
-        self._walls[index] = read_registered(tube, FACES_PER_PIECE)
+        self._walls[index] = read_registered(tube, VERTICES_MAX, INDICES_MAX)
 
     def release_tube(self, index: int) -> None:
         """Forget a tube."""

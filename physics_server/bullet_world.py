@@ -61,11 +61,9 @@ ENGINE: Final = f"bullet {version('pybullet')}"
 WORLDS_MAX: Final = 1024
 """Clients that pybullet can hold in one process."""
 
-FACES_PER_PIECE: Final = 43_690
-"""Triangles of one collision shape; a larger wall is split into several static bodies.
-
-pybullet takes at most 131,072 vertices and 524,288 indices. This many triangles keep within both even where
-they share no vertex."""
+VERTICES_MAX: Final = 131_072
+INDICES_MAX: Final = 524_288
+"""What pybullet takes in one collision shape; a larger wall is split into several static bodies."""
 
 CONTACT_ERP: Final = 0.02
 """Fraction of a penetration that the solver takes back in an inner step.
@@ -122,7 +120,7 @@ class World:
             restitutionVelocityThreshold=RESTITUTION_SPEED,
             physicsClientId=client,
         )
-        pieces = () if wall is None else wall.pieces
+        pieces = [] if wall is None else wall.pieces
         for piece in pieces:
             _add_static(client, piece)
         self.wall, self._body, self._pieces = wall, -1, len(pieces)

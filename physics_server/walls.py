@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final, Literal, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from meshes.errors import MeshError
 from meshes.geometry import Floats
@@ -35,13 +36,13 @@ class RegisteredWall:
     """A wall, ready for any number of lanes."""
 
     wall: Wall
-    pieces: tuple[Piece, ...]
+    pieces: list[Piece]
     reach: float
     """Diagonal of the wall's bounding box (m): from inside of it no ray meets a wall farther away."""
 
 
-def read_registered(tube: TubeReference, faces_per_piece: int) -> RegisteredWall:
-    """Read the wall of a tube that the agent names.
+def read_registered(tube: TubeReference, vertices_max: int, indices_max: int) -> RegisteredWall:
+    """Read the wall of a tube that the agent names, in pieces of at most so many vertices and indices.
 
     Raises:
         Refusal: the file cannot be read as a mesh, or is not the one that the agent read.
@@ -53,16 +54,20 @@ def read_registered(tube: TubeReference, faces_per_piece: int) -> RegisteredWall
     if wall.sha256 != tube.sha256:
         raise Refusal("tube.sha256", f"{tube.sha256}, as the agent read {tube.path}", wall.sha256)
     reach = float(np.linalg.norm(np.ptp(wall.vertices, axis=0)))
-    return RegisteredWall(wall, split(wall, faces_per_piece), reach)
+    return RegisteredWall(wall, split(wall.vertices, wall.faces, vertices_max, indices_max), reach)
 
 
-def split(wall: Wall, faces_per_piece: int) -> tuple[Piece, ...]:
-    """Cut a wall into pieces of at most `faces_per_piece` triangles, each with its own vertices."""
-    pieces = []
-    for start in range(0, len(wall.faces), faces_per_piece):
-        used, corners = np.unique(wall.faces[start : start + faces_per_piece], return_inverse=True)
-        pieces.append(Piece(wall.vertices[used].tolist(), corners.ravel().tolist()))
-    return tuple(pieces)
+def split(vertices: Floats, faces: NDArray[np.int32], vertices_max: int, indices_max: int) -> list[Piece]:
+    """Cut a wall (V, 3), (F, 3) in halves of its faces until each piece is within an engine's limits."""
+    used, corners = np.unique(faces, return_inverse=True)
+    if len(used) > vertices_max or faces.size > indices_max:
+        half = len(faces) // 2
+        return [
+            piece
+            for part in (faces[:half], faces[half:])
+            for piece in split(vertices, part, vertices_max, indices_max)
+        ]
+    return [Piece(vertices[used].tolist(), corners.ravel().tolist())]
 
 
 def ring_around(quaternion: Floats) -> Floats:

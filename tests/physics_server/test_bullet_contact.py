@@ -127,7 +127,7 @@ def test_a_wall_in_pieces_is_the_same_wall(
         return world.step(15)[:, 0, 2]
 
     whole = {x: heights(x) for x in (0.6, 10.3, 19.4)}
-    monkeypatch.setattr("physics_server.bullet.FACES_PER_PIECE", 100)
+    monkeypatch.setattr("physics_server.bullet.INDICES_MAX", 300)
     for x, expected in whole.items():
         np.testing.assert_allclose(heights(x), expected, atol=1e-3)
 
@@ -135,7 +135,7 @@ def test_a_wall_in_pieces_is_the_same_wall(
 def test_a_wall_beyond_the_engines_limits_is_whole(
     rig: Callable[..., Any], tube_file: Callable[..., Any]
 ) -> None:
-    """300,000 triangles and 150,000 vertices, more than one shape can take, still hold the drone everywhere."""
+    """300,000 triangles of 150,000 vertices, more than one shape can take, still hold the drone everywhere."""
     world = rig()
     world.plant.register_tube(0, tube_file(sides=100, rings=1501, length=15.0))
     for x in (0.5, 7.5, 14.5):

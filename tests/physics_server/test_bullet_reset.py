@@ -32,10 +32,10 @@ def crooked_flight(world: Any, lane: int, steps: int, seed: int) -> np.ndarray:
     return np.array(rows)
 
 
-@pytest.fixture(params=[43_690, 300], ids=["one piece", "many pieces"])
+@pytest.fixture(params=[524_288, 900], ids=["one piece", "many pieces"])
 def pieces(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Run with a wall in one shape and with one in many."""
-    monkeypatch.setattr("physics_server.bullet.FACES_PER_PIECE", request.param)
+    monkeypatch.setattr("physics_server.bullet.INDICES_MAX", request.param)
 
 
 @pytest.mark.usefixtures("pieces")
