@@ -48,8 +48,9 @@ class RayScene:
             dists=reach * (1 + 1e-6),
             query="DISTANCE",
         )
-        # The limit goes through float32: a little more of it, then cut, and a miss reads the reach exactly.
-        return np.minimum(hits, reach, dtype=np.float64)  # type: ignore[no-any-return]
+        # The limit went through float32: it was a little more, and is cut here, so that a miss reads the reach.
+        distances: Floats = hits.astype(np.float64)
+        return np.minimum(distances, reach, out=distances)
 
     def blocked(self, origins: Floats, targets: Floats) -> Bools:
         """Whether a wall lies between each origin (M, 3) and its target (M, 3), metres, (M,)."""
