@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from meshes import embree
 from meshes.tube import Tube
-from physics_server import bullet
+from physics_server import bullet_world
 
 Floats = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ def physics_microseconds(tube: Tube, records: NDArray[np.void], inner_steps: int
         inner_steps: of one control step.
         dt: control step (s).
     """
-    p: Any = bullet.pybullet  # type: ignore[attr-defined]  # its one importer
+    p: Any = bullet_world.pybullet  # type: ignore[attr-defined]  # its one importer
     client = p.connect(p.DIRECT)
     try:
         p.setPhysicsEngineParameter(
