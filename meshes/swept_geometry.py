@@ -80,6 +80,7 @@ class SweptGeometry(Geometry):
         self._capacity = self._pool.rows.copy()
         self.assigned: Integers = np.arange(lanes, dtype=np.int64) % len(tubes)
         self._all = np.ones(lanes, dtype=np.bool_)
+        self._anywhere = np.full(lanes, np.nan)
         self._row: Integers = np.zeros(lanes, dtype=np.int64)
 
     def assign(self, lanes: ArrayLike, tube_indices: ArrayLike) -> None:
@@ -125,6 +126,7 @@ class SweptGeometry(Geometry):
         """See `Geometry.rays`; origins in the open, beyond an end plane, see the tube's inside or nothing."""
         distances = np.zeros(origins.shape[:2])
         wanted = self._all if active is None else active
+        origins, directions = _contiguous(origins), _contiguous(directions)
         _rays(self._pool, self.assigned, self._row, wanted, origins, directions, float(reach), distances)
         return distances
 
@@ -132,25 +134,28 @@ class SweptGeometry(Geometry):
         """See `Geometry.project`."""
         n = self.lanes
         found = AxisRows(np.empty(n), np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n))
-        guess = np.full(n, np.nan) if near is None else near
-        _project(self._pool, self.assigned, self._row, points, guess, found)
+        guess = self._anywhere if near is None else _contiguous(near)
+        _project(self._pool, self.assigned, self._row, _contiguous(points), guess, found)
         return AxisPoints(*found)
 
     def axis(self, arc_length: Floats) -> tuple[Floats, Floats]:
         """See `Geometry.axis`."""
         positions, tangents = np.empty((self.lanes, 3)), np.empty((self.lanes, 3))
-        _axis(self._pool, self.assigned, arc_length, positions, tangents)
+        _axis(self._pool, self.assigned, _contiguous(arc_length), positions, tangents)
         return positions, tangents
 
     def visible(self, points: Floats, targets: Floats) -> Bools:
         """See `Geometry.visible`."""
         seen = np.empty(self.lanes, dtype=np.bool_)
-        _visible(self._pool, self.assigned, self._row, points, targets, seen)
+        _visible(self._pool, self.assigned, self._row, _contiguous(points), _contiguous(targets), seen)
         return seen
 
     def inside(self, points: Floats, axis_points: AxisPoints) -> Bools:
         """See `Geometry.inside`."""
-        return self.clearance(points, axis_points) > 0.0
+        within = np.empty(self.lanes, dtype=np.bool_)
+        arc, foot = _contiguous(axis_points.arc_length), _contiguous(axis_points.position)
+        _inside(self._pool, self.assigned, _contiguous(points), arc, foot, within)
+        return within
 
     def clearance(self, points: Floats, axis_points: AxisPoints) -> Floats:
         """See `Geometry.clearance`.
@@ -160,8 +165,14 @@ class SweptGeometry(Geometry):
         it is the negative distance to the rim.
         """
         gaps = np.empty(self.lanes)
-        _clearance(self._pool, self.assigned, points, axis_points.arc_length, axis_points.position, gaps)
+        arc, foot = _contiguous(axis_points.arc_length), _contiguous(axis_points.position)
+        _clearance(self._pool, self.assigned, _contiguous(points), arc, foot, gaps)
         return gaps
+
+
+def _contiguous(array: Floats) -> Floats:
+    # Each other layout of an argument would be compiled anew.
+    return np.ascontiguousarray(array, dtype=np.float64)
 
 
 def _pack(tubes: Sequence[SweptTube]) -> Pool:
@@ -264,8 +275,8 @@ def _project(
         x, y, z = points[lane, 0], points[lane, 1], points[lane, 2]
         low, high = 0, last
         if not np.isnan(near[lane]):
-            low = min(int(np.ceil(max(near[lane] - WINDOW, 0.0) / step)), last - 1)
-            high = max(min(int((near[lane] + WINDOW) / step), last), low + 1)
+            low = int(min(np.ceil(max(near[lane] - WINDOW, 0.0) / step), last - 1.0))
+            high = max(int(min((near[lane] + WINDOW) / step, float(last))), low + 1)
         row, u, _ = settle(axis, low, high, x, y, z)
         rows[lane] = row
         qx, qy, qz = axis_point(axis, step, row, u)
@@ -302,28 +313,48 @@ def _visible(
 
 
 @compiled
+def _depth(
+    tube: Swept, x: float, y: float, z: float, arc: float, fx: float, fy: float, fz: float
+) -> tuple[float, float]:
+    """How far a point is beyond an end plane, and how deep it lies in the section of its axis point (m)."""
+    axis = tube.axis
+    row, u = place(axis, tube.step, arc)
+    vx, vy, vz = x - fx, y - fy, z - fz
+    ahead = 0.0
+    if row == 0 and u <= 0.0:
+        ahead = max(-plane_gap(axis, 0, x, y, z), 0.0)
+    elif row == len(axis) - 2 and u >= 1.0:
+        ahead = max(plane_gap(axis, row + 1, x, y, z), 0.0)
+    if ahead > 0.0:
+        tx, ty, tz = axis_tangent(axis, row, u)
+        along = vx * tx + vy * ty + vz * tz
+        vx, vy, vz = vx - along * tx, vy - along * ty, vz - along * tz
+    return ahead, wall_distance(tube, row, u, vx, vy, vz) - np.sqrt(vx * vx + vy * vy + vz * vz)
+
+
+@compiled
+def _inside(pool: Pool, assigned: Integers, points: Floats, arc: Floats, foot: Floats, out: Bools) -> None:
+    for lane in range(points.shape[0]):
+        tube = _tube(pool, assigned[lane])
+        x, y, z = points[lane, 0], points[lane, 1], points[lane, 2]
+        fx, fy, fz = foot[lane, 0], foot[lane, 1], foot[lane, 2]
+        ahead, deep = _depth(tube, x, y, z, arc[lane], fx, fy, fz)
+        out[lane] = ahead == 0.0 and deep > 0.0
+
+
+@compiled
 def _clearance(
     pool: Pool, assigned: Integers, points: Floats, arc: Floats, foot: Floats, out: Floats
 ) -> None:
     for lane in range(points.shape[0]):
         tube = _tube(pool, assigned[lane])
-        axis = tube.axis
         x, y, z = points[lane, 0], points[lane, 1], points[lane, 2]
-        row, u = place(axis, tube.step, arc[lane])
-        vx, vy, vz = x - foot[lane, 0], y - foot[lane, 1], z - foot[lane, 2]
-        ahead = 0.0  # distance beyond an end plane
-        if row == 0 and u <= 0.0:
-            ahead = min(plane_gap(axis, 0, x, y, z), 0.0)
-        elif row == len(axis) - 2 and u >= 1.0:
-            ahead = max(plane_gap(axis, row + 1, x, y, z), 0.0)
-        if ahead != 0.0:
-            tx, ty, tz = axis_tangent(axis, row, u)
-            vx, vy, vz = vx - ahead * tx, vy - ahead * ty, vz - ahead * tz
-        deep = wall_distance(tube, row, u, vx, vy, vz) - np.sqrt(vx * vx + vy * vy + vz * vz)
-        if ahead != 0.0:
+        fx, fy, fz = foot[lane, 0], foot[lane, 1], foot[lane, 2]
+        ahead, deep = _depth(tube, x, y, z, arc[lane], fx, fy, fz)
+        if ahead > 0.0:
             out[lane] = -np.sqrt(ahead * ahead + deep * deep)
         elif tube.uniform:
             out[lane] = deep
         else:
             distance = nearest_wall(tube, arc[lane], x, y, z)
-            out[lane] = distance if deep >= 0.0 else -distance
+            out[lane] = distance if deep > 0.0 else -distance
