@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from meshes.compiled import compiled
 from meshes.geometry import Floats
 
 LEAF = 4
@@ -50,7 +50,7 @@ def _morton(points: Floats) -> NDArray[np.uint64]:
     return codes
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _fill_boxes(triangles: Floats, leaves: int, boxes: Floats) -> None:
     count = len(triangles)
     for leaf in range(leaves):
@@ -67,7 +67,7 @@ def _fill_boxes(triangles: Floats, leaves: int, boxes: Floats) -> None:
             boxes[node, 3 + k] = max(boxes[2 * node + 1, 3 + k], boxes[2 * node + 2, 3 + k])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def wall_distance(points: Floats, boxes: Floats, triangles: Floats, distances: Floats) -> None:
     """Distance from each point (N, 3) to the nearest triangle of a `WallTree`; writes `distances` (N,)."""
     leaves = (len(boxes) + 1) // 2
@@ -105,7 +105,7 @@ def wall_distance(points: Floats, boxes: Floats, triangles: Floats, distances: F
         distances[n] = math.sqrt(best)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _box_squared(x: float, y: float, z: float, boxes: Floats, node: int) -> float:
     """Squared distance from a point to a box of the tree."""
     dx = max(boxes[node, 0] - x, x - boxes[node, 3], 0.0)
@@ -114,7 +114,7 @@ def _box_squared(x: float, y: float, z: float, boxes: Floats, node: int) -> floa
     return float(dx * dx + dy * dy + dz * dz)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _triangle_squared(x: float, y: float, z: float, triangles: Floats, i: int) -> float:
     """Squared distance from a point to triangle i, which may be a line or a single place.
 
@@ -145,7 +145,7 @@ def _triangle_squared(x: float, y: float, z: float, triangles: Floats, i: int) -
     return float(min(_edge_squared(ww, wu, uu), _edge_squared(ww, wv, vv), _edge_squared(bb, we, ee)))
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _edge_squared(offset_squared: float, along: float, edge_squared: float) -> float:
     """Squared distance to an edge, from dot products of the offset from its start and its own vector."""
     if along <= 0.0 or edge_squared <= 0.0:

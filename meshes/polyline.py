@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from meshes.compiled import compiled
 from meshes.geometry import Floats
 
 Indices = NDArray[np.int64]
@@ -25,7 +25,7 @@ def axis_table(axis: Floats, tangent: Floats, radius: Floats) -> Floats:
     return np.concatenate([axis, tangent, radius[:, None]], axis=1)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def project(
     points: Floats,
     near: Floats,
@@ -72,7 +72,7 @@ def project(
         radius[lane] = a[6] + along * (b[6] - a[6])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def sample(
     arc_length: Floats,
     table: Floats,
@@ -94,7 +94,7 @@ def sample(
         _blend_tangent(a, b, along, tangent[lane])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def between_ends(
     points: Floats, arc_length: Floats, table: Floats, first: Indices, count: Indices, step: Floats
 ) -> NDArray[np.bool_]:
@@ -113,14 +113,14 @@ def between_ends(
     return between
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _ahead(point: Floats, row: Floats) -> float:
     """How far (m) a point (3,) lies along the tangent of a row of the table (7,)."""
     x, y, z = point[0] - row[0], point[1] - row[1], point[2] - row[2]
     return float(x * row[3] + y * row[4] + z * row[5])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def _blend_tangent(a: Floats, b: Floats, along: float, tangent: Floats) -> None:
     """Writes the unit tangent a fraction `along` of the way between two rows of the table (7,)."""
     squared = 0.0

@@ -30,9 +30,9 @@ LEAST_STEPS = 200
 """Steps that a short tube has at least."""
 RING = 36
 """Rays over which the local radius is the mean."""
-LEAST_HITS = 24
-"""Rays of a ring that must meet a wall. From outside of a convex wall fewer than half of them can, while an
-opening of the tube's own diameter in its side, one radius away, lets a quarter of them out."""
+LEAST_HITS = RING // 2 + 1
+"""Rays of a ring that must meet a wall: from outside of a convex wall fewer than half of them can. The rest may
+leave through a side opening, or near an end through a mouth that is not square to the centreline."""
 
 
 @dataclass(frozen=True)
