@@ -1,14 +1,16 @@
 """What is known of N episodes: one record a lane, and one record of the constants that the task is judged by.
 
 The compiled functions of this package work on these two arrays. Their layout is part of the functions' types,
-so that numba's cache compiles anew when a field changes here. It does not notice a change in a compiled
-function or a constant of another file: compiled functions of this package therefore use neither.
+so that numba's cache compiles anew when a field changes here. A change in a compiled function of another file
+it would not notice; therefore the record of the constants carries a digest of those files in its layout.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
-from typing import Any, Literal, TypeAlias
+from pathlib import Path
+from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +24,10 @@ OnContact = Literal["end", "continue"]
 
 LIDAR_SUMMARY = ("h_f", "v_f", "h_r", "v_r", "S_F", "S_R", "mu_F", "mu_R", "l_min", "C_turn")
 """Fields of an episode that sum up its LiDAR, by the names of the paper; distances are over the range."""
+
+
+_COMPILED: Final = ("camera.py", "features.py", "frames.py", "judge.py", "lidar.py", "reward.py")
+"""Files whose compiled functions `agent_client.perception` calls."""
 
 
 def episode_dtype(rays: int) -> np.dtype[np.void]:
@@ -98,6 +104,15 @@ def constants(settings: Settings, dt: float, *, kinematic: bool, on_contact: OnC
         "reward_failure": s.reward.failure,
         "reward_timeout": s.reward.timeout,
     }
+    values[f"sources_{_digest()}"] = 0.0
     record = np.zeros(1, dtype=np.dtype([(name, "f8") for name in values]))
     record[0] = tuple(values.values())
     return record
+
+
+def _digest() -> str:
+    """Digest of the files in _COMPILED, as hexadecimal digits."""
+    digest = hashlib.blake2b(digest_size=8)
+    for name in _COMPILED:
+        digest.update(Path(__file__).with_name(name).read_bytes())
+    return digest.hexdigest()

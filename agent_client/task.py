@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agent_client.camera import look, remember
 from agent_client.episodes import OnContact, Records, constants, episode_dtype
 from agent_client.errors import SettingsError
-from agent_client.features import FEATURES, compute_features, feature_mask
-from agent_client.frames import take_poses
-from agent_client.judge import Outcome, judge, place
-from agent_client.lidar import SPOKES, place_rays, read_rings, ring_circle, ring_sectors
-from agent_client.reward import Regime, choose_regimes, score
+from agent_client.features import FEATURES, feature_mask
+from agent_client.judge import Outcome
+from agent_client.lidar import SPOKES, ring_circle, ring_sectors
+from agent_client.perception import aim, assess
+from agent_client.reward import Regime
 from agent_client.settings import Settings, max_steps
 from meshes.geometry import AxisPoints, Geometry
 from protocol.plant import PoseBatch
@@ -151,6 +150,7 @@ class TubeTask:
         self.ray_nanoseconds = 0
         """How long rays and lines of sight took in the last call."""
         self._step_limit = step_limit
+        self._target_distance, self._reach = settings.camera.target_distance, settings.lidar.reach
         self._constants = constants(settings, dt, kinematic=kinematic, on_contact=on_contact)
         self._mask = feature_mask(settings.masked_features)
         self._episodes: Records = np.zeros(n, dtype=episode_dtype(rays))
@@ -193,7 +193,6 @@ class TubeTask:
             active = np.zeros(self.lanes, dtype=np.bool_)
             active[lanes] = True
         self._perceive(lanes, poses, active, fresh=True)
-        self._describe(lanes)
         return self._step
 
     def observe(self, poses: PoseBatch) -> TaskStep:
@@ -201,42 +200,29 @@ class TubeTask:
 
         Lanes whose episode is over stay as they were at its end, but earn nothing more.
         """
-        lanes, active, episodes = self._all, None, self._episodes
+        lanes, active = self._all, None
         if np.count_nonzero(self._step.outcome):
             active = self._step.outcome == int(Outcome.RUNNING)
             lanes = np.flatnonzero(active)
             self._step.reward[~active] = 0.0
             self._step.reward_terms[~active] = 0.0
         self._perceive(lanes, poses, active, fresh=False)
-        judge(lanes, episodes, self._constants, poses.raw.view(np.int64))
-        score(lanes, episodes, self._constants)
-        self._describe(lanes)
         return self._step
 
     def _perceive(self, lanes: Ints, poses: PoseBatch, active: Bools | None, *, fresh: bool) -> None:
-        """Sense: local frame, place in the tube, LiDAR, camera, memory and regime of `lanes`."""
-        geometry, episodes, constant = self.geometry, self._episodes, self._constants
-        position = self._position
-        np.copyto(position, poses.position)  # contiguous, so that compiled queries see one layout
-        take_poses(lanes, episodes, poses.raw)
-        place_rays(lanes, episodes, constant, self._circle, self._origins, self._directions)
+        """Bring the records and observations of `lanes` up to their poses; judge them unless they are fresh."""
+        geometry, episodes, constant, raw = self.geometry, self._episodes, self._constants, poses.raw
+        position, origins, directions = self._position, self._origins, self._directions
+        aim(lanes, episodes, constant, raw, self._circle, position, origins, directions)
         axis = geometry.project(position, self._near)
-        np.add(axis.arc_length, self.settings.camera.target_distance, out=self._ahead)
+        np.add(axis.arc_length, self._target_distance, out=self._ahead)
         targets, _ = geometry.axis(self._ahead)
         started = time.perf_counter_ns()
-        distances = geometry.rays(self._origins, self._directions, self.settings.lidar.reach, active)
+        distances = geometry.rays(origins, directions, self._reach, active)
         clear = geometry.visible(position, targets)
         self.ray_nanoseconds = time.perf_counter_ns() - started
-        clearance = geometry.clearance(position, axis)
-        place(
-            lanes, episodes, axis.arc_length, axis.position, axis.tangent, axis.radial_distance,
-            axis.radius, clearance, self._near, fresh,
+        assess(
+            lanes, episodes, constant, raw.view(np.int64), axis.arc_length, axis.position, axis.tangent,
+            axis.radial_distance, axis.radius, geometry.clearance(position, axis), distances, targets, clear,
+            self._sectors, self._mask, fresh, self._near, self._step.observation,
         )  # fmt: skip
-        read_rings(lanes, episodes, constant, distances, self._sectors)
-        look(lanes, episodes, constant, targets, clear)
-        remember(lanes, episodes, constant)
-        choose_regimes(lanes, episodes)
-
-    def _describe(self, lanes: Ints) -> None:
-        """Write the observations of `lanes`."""
-        compute_features(lanes, self._episodes, self._constants, self._mask, self._step.observation)
