@@ -328,16 +328,21 @@ def _frame(forward: Floats, side: Floats) -> Floats:
     return np.stack([first, second, np.cross(first, second)])
 
 
-@compiled
 def _turns(points: Floats) -> Floats:
     """Angles (rad) between successive chords of a polyline (M, 3), (M - 2,)."""
-    turns = np.empty(max(len(points) - 2, 0))
-    for i in range(len(turns)):
-        a = points[i + 1] - points[i]
-        b = points[i + 2] - points[i + 1]
-        x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-        turns[i] = np.arctan2(np.sqrt(x * x + y * y + z * z), a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
-    return turns
+    return _angles(np.diff(points, axis=0))
+
+
+@compiled
+def _angles(chords: Floats) -> Floats:
+    """Angles (rad) between successive vectors (C, 3), (C - 1,)."""
+    angles = np.empty(max(len(chords) - 1, 0))
+    for i in range(len(angles)):
+        ax, ay, az = chords[i, 0], chords[i, 1], chords[i, 2]
+        bx, by, bz = chords[i + 1, 0], chords[i + 1, 1], chords[i + 1, 2]
+        cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        angles[i] = np.arctan2(np.sqrt(cx * cx + cy * cy + cz * cz), ax * bx + ay * by + az * bz)
+    return angles
 
 
 @compiled

@@ -141,30 +141,54 @@ def _neighbours(values: Floats) -> tuple[Floats, Floats]:
     return values[:-1], values[1:]
 
 
-@compiled
-def _dot(a: Floats, b: Floats) -> float:
-    # numba's own dot product would need scipy.
-    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
-
-
-@compiled
 def minimal_frame(points: Floats, tangents: Floats) -> Floats:
     """Normals (M, 3) of a rotation-minimising frame, by double reflection.
 
     Source: Wang, Jüttler, Zheng, Liu, "Computation of rotation minimizing frames", ACM TOG 27 (2008).
     """
-    normals = np.empty_like(points)
-    start = np.zeros(3)
-    start[np.argmin(np.abs(tangents[0]))] = 1.0
-    normal = start - _dot(start, tangents[0]) * tangents[0]
-    normals[0] = normal / np.sqrt(_dot(normal, normal))
-    for i in range(len(points) - 1):
-        chord = points[i + 1] - points[i]
-        scale = 2.0 / _dot(chord, chord)
-        normal = normals[i] - scale * _dot(chord, normals[i]) * chord
-        tangent = tangents[i] - scale * _dot(chord, tangents[i]) * chord
-        turn = tangents[i + 1] - tangent
-        normal = normal - 2.0 / _dot(turn, turn) * _dot(turn, normal) * turn
-        normal = normal - _dot(normal, tangents[i + 1]) * tangents[i + 1]
-        normals[i + 1] = normal / np.sqrt(_dot(normal, normal))
+    normals = np.zeros_like(points)
+    normals[0, np.argmin(np.abs(tangents[0]))] = 1.0
+    _carry_normal(points, tangents, normals)
     return normals
+
+
+@compiled
+def _carry_normal(points: Floats, tangents: Floats, normals: Floats) -> None:
+    """Carries the first row of `normals`, any vector across the first tangent, along the curve."""
+    _make_normal(normals[0], tangents[0])
+    tangent, mirror = np.empty(3), np.empty(3)
+    for i in range(len(points) - 1):
+        for k in range(3):
+            normals[i + 1, k], tangent[k] = normals[i, k], tangents[i, k]
+            mirror[k] = points[i + 1, k] - points[i, k]
+        _reflect(normals[i + 1], mirror)
+        _reflect(tangent, mirror)
+        for k in range(3):
+            mirror[k] = tangents[i + 1, k] - tangent[k]
+        _reflect(normals[i + 1], mirror)
+        _make_normal(normals[i + 1], tangents[i + 1])
+
+
+@compiled
+def _reflect(vector: Floats, mirror: Floats) -> None:
+    """Reflects a vector in the plane normal to `mirror`."""
+    scale = 2.0 * _dot(vector, mirror) / _dot(mirror, mirror)
+    for k in range(3):
+        vector[k] -= scale * mirror[k]
+
+
+@compiled
+def _make_normal(vector: Floats, tangent: Floats) -> None:
+    """Makes a vector normal to a tangent, and of length 1."""
+    along = _dot(vector, tangent)
+    for k in range(3):
+        vector[k] -= along * tangent[k]
+    length = np.sqrt(_dot(vector, vector))
+    for k in range(3):
+        vector[k] /= length
+
+
+@compiled
+def _dot(a: Floats, b: Floats) -> float:
+    # numba's own dot product would need scipy.
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
