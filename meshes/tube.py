@@ -223,6 +223,9 @@ def _parse_by_trimesh(content: bytes, path: Path) -> tuple[Floats, NDArray[np.in
 def _local_radius(tube: Tube) -> Floats:
     """Mean wall distance over a ring of rays in each local section, (M,).
 
+    A section that some rays leave through an opening has no such mean: it takes the radius between those of its
+    whole neighbours, since the rays that remain would favour one side.
+
     Raises:
         CentrelineError: a point has too few walls around it, or a wall lies between neighbouring points.
     """
@@ -250,7 +253,11 @@ def _local_radius(tube: Tube) -> Floats:
             f"arc length {tube.arc_length[i]:.2f} m of {tube.length:.2f} m {found}; "
             f"{wrong.sum()} of {len(wrong)} points are wrong: check that both files have the same axes and unit"
         )
-    return np.where(hit, distances, 0.0).sum(axis=1) / hits  # type: ignore[no-any-return]
+    radius = np.where(hit, distances, 0.0).sum(axis=1) / hits
+    whole = hits == RING
+    if whole.any():
+        radius = np.interp(tube.arc_length, tube.arc_length[whole], radius[whole])
+    return radius  # type: ignore[no-any-return]
 
 
 def _ring(tangent: Floats) -> Floats:

@@ -362,3 +362,14 @@ def test_centreline_that_changes_sides_of_a_wall_is_refused(
     path = write_tube(shapes.join(shapes.straight(rings=101), shapes.straight(radius=3.0, rings=101)))
     with pytest.raises(CentrelineError, match=r"m 0 of 36 rays .* and the wall crossed by it"):
         read_tube(path, write_line(tmp_path / "line.obj", (0.5, 0.0, 0.0), (9.5, 2.0, 0.0)))
+
+
+def test_mouth_that_is_not_square_is_accepted(write_tube: WriteTube, shapes: Any, tmp_path: Path) -> None:
+    """A centreline at 20 degrees to the mouth: part of the first rings passes it, so the next whole ring counts."""
+    path = write_tube(shapes.straight(rings=101))
+    slant = np.tan(np.radians(20))
+    tube = read_tube(
+        path, write_line(tmp_path / "line.obj", (0.02, -0.5, 0.0), (2.5, -0.5 + 2.48 * slant, 0.0))
+    )
+    assert tube.length == pytest.approx(2.48 / np.cos(np.radians(20)))
+    assert np.all((tube.radius > 0.8) & (tube.radius < 1.2))
