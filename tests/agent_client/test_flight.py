@@ -13,6 +13,9 @@ from agent_client.flight import PHASES, FlightResult, FlightStep, fly
 from agent_client.kinematic import KinematicPlant
 from agent_client.settings import ActionSettings, Settings, StartSettings
 from agent_client.task import Outcome, TaskStep
+from meshes.curves import generate_curve
+from meshes.swept import circular
+from meshes.swept_geometry import SweptGeometry
 from protocol.agent import SessionSettings
 from protocol.errors import Refusal
 from protocol.plant import CommandBatch
@@ -107,6 +110,24 @@ def test_lanes_do_not_depend_on_the_batch(cylinder: Maker, policy: bool) -> None
         assert alone.steps[0] == together.steps[lane]
         for one, all_lanes in zip(seen.arrays, seen_together.arrays, strict=False):
             for name in ("command", "pose", "actions", "observation", "reward", "terms", "lidar"):
+                np.testing.assert_array_equal(one[name][0], all_lanes[name][lane], err_msg=name)
+
+
+def test_lanes_in_swept_tubes_do_not_depend_on_the_batch() -> None:
+    """The same with compiled geometry and a bend in every tube."""
+    settings = Settings()
+    tubes = [circular(generate_curve(2, [seed], 8.0)) for seed in range(3)]
+
+    def run(lanes: list[int]) -> tuple[FlightResult, Seen]:
+        tube, seen = SweptGeometry([tubes[lane] for lane in lanes], len(lanes)), Seen()
+        return flight(tube, PurePursuit(tube, settings), settings, seeds=lanes, on_step=seen), seen
+
+    together, seen_together = run([0, 1, 2])
+    assert together.outcome == (Outcome.SUCCESS,) * 3
+    for lane in range(3):
+        _, seen = run([lane])
+        for one, all_lanes in zip(seen.arrays, seen_together.arrays, strict=False):
+            for name in ("pose", "observation", "reward", "lidar"):
                 np.testing.assert_array_equal(one[name][0], all_lanes[name][lane], err_msg=name)
 
 
