@@ -111,6 +111,7 @@ def main() -> None:
         status = exit_status(error)
         if status is None:
             raise
-        if str(error):
-            click.echo(f"cosim: {error}", err=True)
+        for line in (f"cosim: {error}" if str(error) else "", *getattr(error, "__notes__", ())):
+            if line:
+                click.echo(line, err=True)
         sys.exit(status)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
 from cosim.errors import OutputError
 from cosim.recording import LOG, MANIFEST
+from protocol.errors import SessionError
 
 
 def check_folder(out: Path | None) -> None:
@@ -29,22 +34,32 @@ def check_folder(out: Path | None) -> None:
         )
 
 
-def make_folder(out: Path | None, label: str) -> Path:
-    """Create the run's folder: `out`, or a new one under runs/ named by time (UTC) and `label`.
+@contextmanager
+def new_folder(out: Path | None, label: str) -> Iterator[Path]:
+    """The run's folder: `out`, or a new one under runs/ named by time (UTC) and `label`.
+
+    It goes again where the session could not even be offered, since then there is nothing to keep.
 
     Raises:
         OutputError: it cannot be created.
     """
-    if out is None:
-        stamp = datetime.now(UTC).strftime("%Y-%m-%d-%H%M%S")
-        stem = Path("runs") / f"{stamp}-{label}"
-        out = stem
-        count = 1
-        while out.exists():
-            count += 1
-            out = stem.with_name(f"{stem.name}-{count}")
+    folder = out if out is not None else _free_name(label)
+    existed = folder.exists()
     try:
-        out.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"--out {out}: cannot be created: {error.strerror}") from error
-    return out
+        raise OutputError(f"--out {folder}: cannot be created: {error.strerror}") from error
+    try:
+        yield folder
+    except SessionError:
+        if not existed and not (folder / MANIFEST).exists():
+            shutil.rmtree(folder)
+        raise
+
+
+def _free_name(label: str) -> Path:
+    """A path under runs/ that does not exist."""
+    stamp = datetime.now(UTC).strftime("%Y-%m-%d-%H%M%S")
+    stem = Path("runs") / f"{stamp}-{label}"
+    names = itertools.chain([stem], (stem.with_name(f"{stem.name}-{n}") for n in itertools.count(2)))
+    return next(name for name in names if not name.exists())

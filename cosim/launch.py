@@ -18,12 +18,13 @@ from agent_client.settings import max_steps
 from agent_client.task import Outcome
 from cosim import __version__
 from cosim.errors import Terminated
-from cosim.folders import check_folder, make_folder
+from cosim.folders import check_folder, new_folder
 from cosim.inputs import Pilot, parse_parameters, read_pilot, read_tube_input
 from cosim.live import LiveLine
 from cosim.options import FlightOptions
 from cosim.recording import Recorder
 from cosim.sessions import physics_session, rendezvous_of
+from cosim.supervise import physics_command
 from meshes.mesh_geometry import MeshGeometry
 from meshes.tube import Tube
 from protocol.agent import AgentSession, SessionSettings
@@ -51,6 +52,7 @@ def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
         click.echo(text, err=as_json)
 
     check_folder(options.out)
+    command = None if options.connect is not None else physics_command(options.server)
     parameters = parse_parameters(options.parameters)
     rendezvous = rendezvous_of(options.connect, options.session, options.transport)
     tube, tube_notes = read_tube_input(options)
@@ -59,17 +61,15 @@ def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
     settings = SessionSettings(1, pilot.dt, options.physics_dt)
     for note in (*tube_notes, *pilot.notes):
         say(note)
-    folder = make_folder(options.out, f"{tube.path.stem}-{pilot.description['name']}-seed{options.seed}")
-    if options.connect is not None:
+    label = f"{tube.path.stem}-{pilot.description['name']}-seed{options.seed}"
+    if command is None:
         say(f"waiting for a physics peer at {rendezvous} (at most {options.attach_timeout:g} s)")
-    with physics_session(
-        rendezvous,
-        settings,
-        server=options.server,
-        connect=options.connect is not None,
-        attach_timeout=options.attach_timeout,
-        log_dir=folder,
-    ) as session:
+    with (
+        new_folder(options.out, label) as folder,
+        physics_session(
+            rendezvous, settings, command=command, attach_timeout=options.attach_timeout, log_dir=folder
+        ) as session,
+    ):
         plant = session.description
         say(f"physics: {plant.name} {plant.version}, engine {plant.engine}")
         manifest = _manifest(options, tube, pilot, session, parameters, rendezvous)

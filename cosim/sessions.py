@@ -6,13 +6,13 @@ import os
 import re
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
 
 from cosim.errors import CosimError
-from cosim.supervise import PhysicsProcess, physics_command
+from cosim.supervise import PhysicsProcess
 from protocol.agent import AgentSession, SessionSettings
 from protocol.errors import ProtocolError
 
@@ -39,8 +39,7 @@ def physics_session(
     rendezvous: str,
     settings: SessionSettings,
     *,
-    server: str | None,
-    connect: bool,
+    command: Sequence[str] | None,
     attach_timeout: float,
     log_dir: Path,
 ) -> Iterator[AgentSession]:
@@ -49,8 +48,8 @@ def physics_session(
     Args:
         rendezvous: where the two sides meet.
         settings: lanes and time steps.
-        server: the user's physics command, or None for ours.
-        connect: wait for a peer that somebody else starts, and leave it alone at the end.
+        command: starts the physics process; None waits for a peer that somebody else starts, and leaves it
+            alone at the end.
         attach_timeout: patience for the peer's attach (s).
         log_dir: where the process's stdout and stderr are kept.
 
@@ -60,8 +59,8 @@ def physics_session(
     """
     with ExitStack() as stack:
         process = None
-        if not connect:
-            process = stack.enter_context(PhysicsProcess(physics_command(server), rendezvous, log_dir))
+        if command is not None:
+            process = stack.enter_context(PhysicsProcess(command, rendezvous, log_dir))
         try:
             watch = None if process is None else process.watch
             yield stack.enter_context(

@@ -31,7 +31,7 @@ ONE_IMPORTER = {
 }
 """Heavy or delicate modules that exactly one file of one package imports."""
 
-LEARNING_FILES = {"environment.py", "training.py", "plain_checkpoint.py"}
+LEARNING_FILES = {"environment.py", "training.py", "sb3_policy.py"}
 """The only files that import torch, stable-baselines3 or gymnasium."""
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
+import shutil
+import subprocess
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from flights import Done
+from flights import DEADLINE, Done, command, environment
 
 SQUARE_TUBE = """v 0 1 1\nv 0 -1 1\nv 0 -1 -1\nv 0 1 -1\nv 9 1 1\nv 9 -1 1\nv 9 -1 -1\nv 9 1 -1
 f 1 2 6 5\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8\n"""
@@ -102,6 +105,28 @@ def test_an_output_folder_that_cannot_be_written(fly: Callable[..., Done], tmp_p
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "manifest.json").write_text("{}")
     refused(fly("--out", str(tmp_path / "old")), tmp_path, "old", "already")
+
+
+def test_no_room_in_shared_memory(tmp_path: Path, session_name: str) -> None:
+    """Where /dev/shm is too small the launch says so, with status 2, in place of a bus error."""
+    launch = command("launch", "--json", "--session", session_name, "--out", str(tmp_path / "run"))
+    inside = f"mount -t tmpfs -o size=4k tmpfs /dev/shm && exec {shlex.join(launch)}"
+    namespace = ["unshare", "--mount", "sh", "-c"]
+    if (
+        shutil.which("unshare") is None
+        or subprocess.run([*namespace, "mount -t tmpfs t /mnt"], check=False).returncode
+    ):
+        pytest.skip("needs the right to mount a small /dev/shm in a namespace of its own")
+    done = subprocess.run(
+        [*namespace, inside],
+        check=False,
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=environment(),
+        timeout=DEADLINE,
+    )
+    refused(Done(done.returncode, done.stdout, done.stderr), tmp_path, "no room", "/dev/shm")
 
 
 def test_values_out_of_range(fly: Callable[..., Done], tmp_path: Path) -> None:
