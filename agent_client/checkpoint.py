@@ -2,6 +2,9 @@
 
 `actor.npz` holds the actor's weights in the open, read without pickle and without torch:
 `weight_i` (inputs, outputs) and `bias_i` (outputs,), float32, one pair a layer, the logits last.
+
+The rest is the model as stable-baselines3 trained it, on normalised observations: whoever flies it by `PPO.load`
+must normalise and mask as the contract says.
 """
 
 from __future__ import annotations
@@ -28,8 +31,9 @@ ACTOR_FILE: Final = "actor.npz"
 SB3_FILES: Final = ("data", "policy.pth")
 """What every stable-baselines3 .zip holds."""
 
-# Entries carry this date, so that the same policy is the same file.
+# Entries carry this date, and the machine is left out, so that the same policy is the same file.
 _DATE: Final = (2000, 1, 1, 0, 0, 0)
+_SYSTEM_INFO: Final = "system_info.txt"
 
 
 @dataclass(frozen=True)
@@ -101,7 +105,8 @@ def write_checkpoint(path: Path, sb3_zip: bytes, contract: Contract, layers: Seq
                 _put(target, CONTRACT_FILE, to_json(contract).encode("utf-8"))
                 _put(target, ACTOR_FILE, _layer_bytes(layers))
                 for entry in source.namelist():
-                    _put(target, entry, source.read(entry))
+                    if entry != _SYSTEM_INFO:
+                        _put(target, entry, source.read(entry))
             file.flush()
             os.fsync(file.fileno())
         temporary.chmod(0o644)  # mkstemp's 0600 would keep others from reading a shared checkpoint

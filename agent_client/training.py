@@ -203,8 +203,11 @@ class LinearRate:
         return self.last + (self.first - self.last) * remaining
 
 
-_NOT_THE_POLICY: Final = ("ep_info_buffer", "ep_success_buffer", "tensorboard_log", "start_time")
-"""Attributes of the model that are no part of a checkpoint: statistics, clocks and paths."""
+_NOT_THE_POLICY: Final = (
+    "ep_info_buffer", "ep_success_buffer", "tensorboard_log", "start_time",
+    "_last_obs", "_last_original_obs", "_last_episode_starts",
+)  # fmt: skip
+"""Attributes of the model that are no part of a checkpoint: statistics, clocks, paths and the last step."""
 
 
 class _Watcher(BaseCallback):
