@@ -42,33 +42,49 @@ def take_poses(lanes: Ints, episodes: Records, poses: Floats) -> None:
             e.speed += poses[i, 7 + c] * frame[0, c]
 
 
+@njit(cache=True, error_model="numpy")
 def frames_along(directions: Floats) -> Floats:
     """Local frames (N, 3, 3) that look along directions (N, 3), with up as near to world up as can be.
 
     Where a direction is within 18 degrees of the vertical, up is taken near world x instead: the roll of a
     start is a convention, and nothing later depends on it.
     """
-    forward = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    steep = np.abs(forward[:, 2:3]) > 0.95
-    hint = np.where(steep, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
-    right = np.cross(forward, hint)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    frames: Floats = np.stack([forward, np.cross(right, forward), right], axis=1)
+    frames = np.empty((len(directions), 3, 3))
+    for i in range(len(directions)):
+        x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+        norm = np.sqrt(x * x + y * y + z * z)
+        x, y, z = x / norm, y / norm, z / norm
+        # r = f x hint, u = r x f
+        rx, ry, rz = (0.0, z, -y) if abs(z) > 0.95 else (y, -x, 0.0)
+        norm = np.sqrt(rx * rx + ry * ry + rz * rz)
+        rx, ry, rz = rx / norm, ry / norm, rz / norm
+        frames[i, 0, 0], frames[i, 0, 1], frames[i, 0, 2] = x, y, z
+        frames[i, 1, 0], frames[i, 1, 1], frames[i, 1, 2] = ry * z - rz * y, rz * x - rx * z, rx * y - ry * x
+        frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2] = rx, ry, rz
     return frames
 
 
-def quaternions(frame: Floats) -> Floats:
+@njit(cache=True, error_model="numpy")
+def quaternions(frames: Floats) -> Floats:
     """Unit quaternions (N, 4), x y z w, body to world, w >= 0, of orthonormal local frames (N, 3, 3)."""
-    m = np.stack([frame[:, 0], -frame[:, 2], frame[:, 1]], axis=2)  # columns f, left, u
-    x2, y2, z2 = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
-    # 4 q q^T; its row of the largest diagonal element is q times a factor that is never small.
-    outer = np.empty((len(m), 4, 4))
-    outer[:, 0, 0], outer[:, 1, 1] = 1.0 + x2 - y2 - z2, 1.0 - x2 + y2 - z2
-    outer[:, 2, 2], outer[:, 3, 3] = 1.0 - x2 - y2 + z2, 1.0 + x2 + y2 + z2
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        outer[:, i, j] = outer[:, j, i] = m[:, i, j] + m[:, j, i]
-        outer[:, k, 3] = outer[:, 3, k] = m[:, j, i] - m[:, i, j]
-    largest = np.argmax(np.diagonal(outer, axis1=1, axis2=2), axis=1)
-    q: Floats = outer[np.arange(len(m)), largest]
-    q /= np.linalg.norm(q, axis=1, keepdims=True) * np.where(q[:, 3:4] < 0.0, -1.0, 1.0)
-    return q
+    found = np.empty((len(frames), 4))
+    for i in range(len(frames)):
+        # The rotation's columns are f, -r, u. The largest component is found first, so that no root of a
+        # small difference is taken (Shepperd's method).
+        m00, m10, m20 = frames[i, 0, 0], frames[i, 0, 1], frames[i, 0, 2]
+        m01, m11, m21 = -frames[i, 2, 0], -frames[i, 2, 1], -frames[i, 2, 2]
+        m02, m12, m22 = frames[i, 1, 0], frames[i, 1, 1], frames[i, 1, 2]
+        trace = m00 + m11 + m22
+        if trace >= m00 and trace >= m11 and trace >= m22:
+            x, y, z, w = m21 - m12, m02 - m20, m10 - m01, 1.0 + trace
+        elif m00 >= m11 and m00 >= m22:
+            x, y, z, w = 1.0 + m00 - m11 - m22, m01 + m10, m02 + m20, m21 - m12
+        elif m11 >= m22:
+            x, y, z, w = m01 + m10, 1.0 - m00 + m11 - m22, m12 + m21, m02 - m20
+        else:
+            x, y, z, w = m02 + m20, m12 + m21, 1.0 - m00 - m11 + m22, m10 - m01
+        norm = np.sqrt(x * x + y * y + z * z + w * w)
+        if w < 0.0:
+            norm = -norm
+        found[i, 0], found[i, 1], found[i, 2], found[i, 3] = x / norm, y / norm, z / norm, w / norm
+    return found
