@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import os
-import re
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Final
 
 from cosim.errors import CosimError
 from cosim.supervise import PhysicsProcess
 from protocol.agent import AgentSession, SessionSettings
 from protocol.errors import ProtocolError
-
-NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
 def rendezvous_of(connect: str | None, name: str | None, transport: str) -> str:
@@ -29,8 +25,8 @@ def rendezvous_of(connect: str | None, name: str | None, transport: str) -> str:
         return connect if ":" in connect else f"{transport}:{connect}"
     if name is None:
         name = f"cosim-{os.getpid()}-{time.time_ns() % 1_000_000_000:09d}"
-    if not NAME.fullmatch(name):
-        raise CosimError(f"--session: expected letters, digits, '.', '_' and '-', found {name!r}")
+    if Path(name).name != name:
+        raise CosimError(f"--session: expected a name without a folder, found {name!r}")
     return f"shm:{name}" if transport == "shm" else f"file:{Path(tempfile.gettempdir()) / name}"
 
 

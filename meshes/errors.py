@@ -1,9 +1,9 @@
 """What can be wrong with a tube.
 
-    MeshError
-    ├── MeshReadError      the file is missing, unreadable, empty, or of a form that is not read
-    ├── CentrelineError    the centreline branches, is a loop, has gaps, or lies outside the tube
-    └── CurveError         a generated curve is too tight or comes too near to itself
+MeshError
+├── MeshReadError      the file is missing, unreadable, empty, or of a form that is not read
+├── CentrelineError    the centreline branches, is a loop, has gaps, or lies outside the tube
+└── CurveError         a generated curve is too tight or comes too near to itself
 """
 
 from __future__ import annotations

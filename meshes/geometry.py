@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+WINDOW = 2.0
+"""A search of the axis near a known arc length keeps within this distance of it (m)."""
+
 
 @dataclass(frozen=True)
 class AxisPoints:
@@ -62,7 +65,7 @@ class Geometry(ABC):
 
         Args:
             points: (N, 3).
-            near: (N,) arc lengths (m); the search then keeps within 2 m of them, so that a tube that passes
+            near: (N,) arc lengths (m); the search then keeps within WINDOW of them, so that a tube that passes
                 close to itself cannot make progress jump. NaN, or None for all, searches the whole axis.
         """
 

@@ -152,7 +152,7 @@ class MeshGeometry(Geometry):
         return clearance
 
     def _between_ends(self, points: Floats, axis_points: AxisPoints) -> Bools:
-        return polyline.between_ends(  # type: ignore[no-any-return]
+        return polyline.between_ends(
             _contiguous(points),
             _contiguous(axis_points.arc_length),
             self._table,

@@ -12,12 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from meshes.compiled import compiled
-from meshes.geometry import Floats
+from meshes.geometry import WINDOW, Floats
 
 Indices = NDArray[np.int64]
-
-WINDOW = 2.0
-"""A search near a known arc length keeps within this distance of it (m)."""
 
 
 def axis_table(axis: Floats, tangent: Floats, radius: Floats) -> Floats:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from meshes.compiled import compiled
 from meshes.errors import MeshError
-from meshes.geometry import AxisPoints, Bools, Floats, Geometry
+from meshes.geometry import WINDOW, AxisPoints, Bools, Floats, Geometry
 from meshes.swept import SweptTube, segment_curvature
 from meshes.swept_kernels import (
     Swept,
@@ -30,9 +30,6 @@ from meshes.swept_kernels import (
 )
 
 Integers = NDArray[np.int64]
-
-WINDOW = 2.0
-"""How far from the arc length that is given the nearest axis point is searched (m)."""
 
 
 class Pool(NamedTuple):
