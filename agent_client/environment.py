@@ -143,10 +143,9 @@ class TubeVecEnv(VecEnv):
     def _begin(self, lanes: Ints) -> Singles:
         """Draw level, tube and start of new episodes in `lanes`; returns the observations of all lanes."""
         rng = self._rng
-        for lane in lanes.tolist():
-            level = self.curriculum.draw(rng)
-            self._level[lane] = level
-            self._geometry.assign([lane], [self._first[level] + int(rng.integers(self._sizes[level]))])
+        levels = [self.curriculum.draw(rng) for _ in lanes]
+        self._level[lanes] = levels
+        self._geometry.assign(lanes, [self._first[a] + int(rng.integers(self._sizes[a])) for a in levels])
         self._returns[lanes] = 0.0
         draw_starts(self._resets, lanes, self._geometry, self._settings.start, rng)
         poses = self.session.reset(self._resets)
