@@ -177,8 +177,8 @@ def read_farewell(view: memoryview) -> tuple[int, str]:
 def part(view: memoryview, error: BaseException) -> None:
     """Write the farewell that an error of ours, or one that we found in the peer, calls for."""
     if isinstance(error, PeerLost):
-        return
-    if isinstance(error, PeerViolation):
+        write_farewell(view, Farewell.STOPPED, f"it gave up: {error}")
+    elif isinstance(error, PeerViolation):
         write_farewell(view, Farewell.VIOLATION, str(error))
     elif isinstance(error, HandshakeError):
         write_farewell(view, Farewell.HANDSHAKE, str(error))

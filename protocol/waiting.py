@@ -164,8 +164,8 @@ class Waiter:
     def _look(self, old: int, waited: float, step: int, phase: str) -> None:
         try:
             state = self.peer.check(step, phase)
-        except PeerLost:
-            if self._words[self._doorbell] != old:  # it answered before it ended
+        except ProtocolError:
+            if self._words[self._doorbell] != old:  # it rang before it ended
                 return
             raise
         if self.deadline is not None and waited > self.deadline:
