@@ -15,11 +15,10 @@ import numpy as np
 
 from agent_client.flight import PHASES
 from agent_client.settings import Settings
-from cosim.inputs import read_tube_input
 from cosim.loop_limit import network_microseconds, physics_microseconds, rays_microseconds
-from cosim.options import FlightOptions
 from cosim.round_trip import Quantiles, measure
 from cosim.runs import read_run
+from meshes.tube import INDUSTRIAL, read_tube
 
 LAYERS: Final = (37, 256, 128, 36)
 """The paper's network."""
@@ -50,7 +49,7 @@ def bench(*, as_json: bool, quick: bool) -> None:
 
 def measure_loop(repeats: int) -> dict[str, Any]:
     """Fly the shipped conduit and, in turn, run the bare loop over the same states; medians over the repeats."""
-    tube, _ = read_tube_input(FlightOptions())
+    tube = read_tube(INDUSTRIAL)
     settings = Settings()
     rows: list[dict[str, float]] = []
     limits: list[dict[str, float]] = []

@@ -10,9 +10,8 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
-from cosim.errors import OutputError
+from cosim.errors import USAGE, OutputError, exit_status
 from cosim.recording import LOG, MANIFEST
-from protocol.errors import SessionError
 
 
 def check_folder(out: Path | None) -> None:
@@ -38,7 +37,7 @@ def check_folder(out: Path | None) -> None:
 def new_folder(out: Path | None, label: str) -> Iterator[Path]:
     """The run's folder: `out`, or a new one under runs/ named by time (UTC) and `label`.
 
-    It goes again where the session could not even be offered, since then there is nothing to keep.
+    It goes again where no flight began because of bad input, since then there is nothing to keep.
 
     Raises:
         OutputError: it cannot be created.
@@ -51,8 +50,8 @@ def new_folder(out: Path | None, label: str) -> Iterator[Path]:
         raise OutputError(f"--out {folder}: cannot be created: {error.strerror}") from error
     try:
         yield folder
-    except SessionError:
-        if not existed and not (folder / MANIFEST).exists():
+    except BaseException as error:
+        if exit_status(error) == USAGE and not existed and not (folder / MANIFEST).exists():
             shutil.rmtree(folder)
         raise
 

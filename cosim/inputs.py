@@ -6,7 +6,7 @@ import hashlib
 import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import agent_client
 from agent_client.contract import require_match, running_contract
@@ -16,7 +16,7 @@ from agent_client.settings import DEFAULT_DT, Settings
 from cosim.errors import CosimError
 from cosim.options import SHIPPED_MESH, SHIPPED_POLICY, FlightOptions
 from meshes.mesh_geometry import MeshGeometry
-from meshes.tube import INDUSTRIAL, Tube, read_tube
+from meshes.tube import INDUSTRIAL, Axes, Tube, read_tube
 from protocol.plant import PARAMETER_INDEX
 
 PURE_PURSUIT: Final = "pure-pursuit"
@@ -34,20 +34,61 @@ class Pilot:
     notes: tuple[str, ...]
 
 
-def read_tube_input(options: FlightOptions) -> tuple[Tube, tuple[str, ...]]:
-    """The tube that the options name, and what has to be said about it.
+@dataclass(frozen=True)
+class Named:
+    """The files that the options name, before they are read."""
+
+    mesh: Path
+    policy: Path | None
+    """None for Pure Pursuit."""
+    notes: tuple[str, ...]
+    """What was chosen for the user, to be said."""
+
+    @property
+    def label(self) -> str:
+        """Names of tube and pilot for a folder."""
+        return f"{self.mesh.stem}-{PURE_PURSUIT if self.policy is None else self.policy.stem}"
+
+
+def name_inputs(options: FlightOptions) -> Named:
+    """Which mesh and policy are meant; the shipped ones where their names are given and no such file exists.
+
+    Raises:
+        CosimError: a file that does not exist.
+    """
+    notes = []
+    paths: dict[str, Path | None] = {}
+    for what, name, shipped_name, shipped in (
+        ("mesh", options.mesh, SHIPPED_MESH, INDUSTRIAL),
+        ("policy", options.policy, SHIPPED_POLICY, SHIPPED_CHECKPOINT),
+    ):
+        path = Path(name)
+        if name == PURE_PURSUIT and what == "policy":
+            paths[what] = None
+            continue
+        if name == shipped_name and not path.exists():
+            path = shipped
+            notes.append(f"{what}: {shipped_name} is the shipped one")
+        if not path.is_file():
+            raise CosimError(f"--{what} {name}: expected a file, found no such file")
+        paths[what] = path
+    mesh = paths["mesh"]
+    assert mesh is not None
+    return Named(mesh, paths["policy"], tuple(notes))
+
+
+def read_tube_input(options: FlightOptions, named: Named) -> Tube:
+    """The tube that the options name.
 
     Raises:
         MeshError: the mesh or its centreline cannot be used.
     """
-    path, notes = _shipped(options.mesh, SHIPPED_MESH, INDUSTRIAL, "mesh")
-    tube = read_tube(path, options.centerline, options.axes, options.scale, options.start_end)  # type: ignore[arg-type]
-    if tube.wall.duplicate_faces:
-        notes += (f"mesh: {tube.wall.duplicate_faces} duplicate faces dropped",)
-    return tube, notes
+    axes: Axes = "yup" if options.axes == "yup" else "zup"
+    start_end: Literal["first", "last"] = "last" if options.start_end == "last" else "first"
+    return read_tube(named.mesh, options.centerline, axes, options.scale, start_end)
 
 
-def read_pilot(options: FlightOptions, geometry: MeshGeometry) -> Pilot:
+def read_pilot(options: FlightOptions, named: Named, geometry: MeshGeometry) -> Pilot:
     """The controller that the options name, checked against what will run.
 
     Raises:
@@ -57,7 +98,7 @@ def read_pilot(options: FlightOptions, geometry: MeshGeometry) -> Pilot:
     base = Settings()
     if options.compensation is not None:
         base = replace(base, drone=replace(base.drone, compensation=options.compensation))
-    if options.policy == PURE_PURSUIT:
+    if named.policy is None:
         lookahead = DEFAULT_LOOKAHEAD if options.lookahead is None else options.lookahead
         pursuit = PurePursuit(geometry, base, lookahead=lookahead)
         return Pilot(
@@ -74,7 +115,7 @@ def read_pilot(options: FlightOptions, geometry: MeshGeometry) -> Pilot:
         )
     if options.lookahead is not None:
         raise CosimError("--lookahead: only --policy pure-pursuit has one")
-    path, notes = _shipped(options.policy, SHIPPED_POLICY, SHIPPED_CHECKPOINT, "policy")
+    path = named.policy
     policy = load_policy(path)
     contract = policy.contract
     settings = replace(base, masked_features=contract.masked)
@@ -83,7 +124,7 @@ def read_pilot(options: FlightOptions, geometry: MeshGeometry) -> Pilot:
     if options.compensation is not None:
         allowed.add("drone.compensation")  # naming a value is allowing it
     mismatch = require_match(contract, running_contract(settings, dt), str(path), allowed)
-    notes += tuple(
+    notes = tuple(
         f"policy: {difference.name}: made for {difference.expected}, flown with {difference.found}"
         for difference in mismatch
     )
@@ -119,10 +160,3 @@ def parse_parameters(pairs: tuple[str, ...]) -> dict[str, float]:
         if not math.isfinite(values[name]):
             raise CosimError(f"--parameter {name}: expected a finite number, found {text!r}")
     return values
-
-
-def _shipped(name: str, shipped_name: str, shipped: Path, what: str) -> tuple[Path, tuple[str, ...]]:
-    """The path that was named; the shipped file where its name is given and no such file exists."""
-    if name == shipped_name and not Path(name).exists():
-        return shipped, (f"{what}: {shipped_name} is the shipped one",)
-    return Path(name), ()

@@ -6,6 +6,7 @@ import json
 import os
 import platform
 import time
+from contextlib import ExitStack
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
@@ -19,12 +20,12 @@ from agent_client.task import Outcome
 from cosim import __version__
 from cosim.errors import Terminated
 from cosim.folders import check_folder, new_folder
-from cosim.inputs import Pilot, parse_parameters, read_pilot, read_tube_input
+from cosim.inputs import Pilot, name_inputs, parse_parameters, read_pilot, read_tube_input
 from cosim.live import LiveLine
 from cosim.options import FlightOptions
 from cosim.recording import Recorder
 from cosim.sessions import physics_session, rendezvous_of
-from cosim.supervise import physics_command
+from cosim.supervise import PhysicsProcess, physics_command
 from meshes.mesh_geometry import MeshGeometry
 from meshes.tube import Tube
 from protocol.agent import AgentSession, SessionSettings
@@ -40,8 +41,8 @@ PACKAGES: Final = ("numpy", "numba", "pybullet", "embreex")
 def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
     """Fly once, say what happened, and return whether the outcome is success.
 
-    Everything is read and checked before a process is started or a folder made, so that bad input leaves
-    nothing behind. With `as_json` stdout holds one JSON object and everything else goes to stderr.
+    The physics process starts up while the tube is read; bad input ends it and leaves nothing behind. With
+    `as_json` stdout holds one JSON object and everything else goes to stderr.
 
     Raises:
         CosimError, MeshError, AgentError, SessionError: bad input.
@@ -55,21 +56,25 @@ def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
     command = None if options.connect is not None else physics_command(options.server)
     parameters = parse_parameters(options.parameters)
     rendezvous = rendezvous_of(options.connect, options.session, options.transport)
-    tube, tube_notes = read_tube_input(options)
-    geometry = MeshGeometry([tube])
-    pilot = read_pilot(options, geometry)
-    settings = SessionSettings(1, pilot.dt, options.physics_dt)
-    for note in (*tube_notes, *pilot.notes):
+    named = name_inputs(options)
+    for note in named.notes:
         say(note)
-    label = f"{tube.path.stem}-{pilot.description['name']}-seed{options.seed}"
-    if command is None:
-        say(f"waiting for a physics peer at {rendezvous} (at most {options.attach_timeout:g} s)")
-    with (
-        new_folder(options.out, label) as folder,
-        physics_session(
-            rendezvous, settings, command=command, attach_timeout=options.attach_timeout, log_dir=folder
-        ) as session,
-    ):
+    with ExitStack() as stack:
+        folder = stack.enter_context(new_folder(options.out, f"{named.label}-seed{options.seed}"))
+        process = None
+        if command is None:
+            say(f"waiting for a physics peer at {rendezvous} (at most {options.attach_timeout:g} s)")
+        else:
+            process = stack.enter_context(PhysicsProcess(command, rendezvous, folder))
+        tube = read_tube_input(options, named)
+        geometry = MeshGeometry([tube])
+        pilot = read_pilot(options, named, geometry)
+        for note in pilot.notes:
+            say(note)
+        settings = SessionSettings(1, pilot.dt, options.physics_dt)
+        session = stack.enter_context(
+            physics_session(rendezvous, settings, process=process, attach_timeout=options.attach_timeout)
+        )
         plant = session.description
         say(f"physics: {plant.name} {plant.version}, engine {plant.engine}")
         manifest = _manifest(options, tube, pilot, session, parameters, rendezvous)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from cosim.errors import CosimError
@@ -35,34 +35,26 @@ def physics_session(
     rendezvous: str,
     settings: SessionSettings,
     *,
-    command: Sequence[str] | None,
+    process: PhysicsProcess | None,
     attach_timeout: float,
-    log_dir: Path,
 ) -> Iterator[AgentSession]:
-    """An open session; the process that was started for it, if one was, is ended with it.
+    """An open session with a physics process.
 
     Args:
         rendezvous: where the two sides meet.
         settings: lanes and time steps.
-        command: starts the physics process; None waits for a peer that somebody else starts, and leaves it
-            alone at the end.
+        process: ours to watch; None for a peer that somebody else starts.
         attach_timeout: patience for the peer's attach (s).
-        log_dir: where the process's stdout and stderr are kept.
 
     Raises:
         ProtocolError: the session could not be opened, or failed while it was used; the last lines that the
             process wrote to its stderr are added as a note.
     """
-    with ExitStack() as stack:
-        process = None
-        if command is not None:
-            process = stack.enter_context(PhysicsProcess(command, rendezvous, log_dir))
-        try:
-            watch = None if process is None else process.watch
-            yield stack.enter_context(
-                AgentSession.open(rendezvous, settings, watch=watch, attach_timeout=attach_timeout)
-            )
-        except ProtocolError as error:
-            if process is not None and (words := process.last_words()):
-                error.add_note(f"the physics process said: {words}")
-            raise
+    watch = None if process is None else process.watch
+    try:
+        with AgentSession.open(rendezvous, settings, watch=watch, attach_timeout=attach_timeout) as session:
+            yield session
+    except ProtocolError as error:
+        if process is not None and (words := process.last_words()):
+            error.add_note(f"the physics process said: {words}")
+        raise
