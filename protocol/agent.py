@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import secrets
 import struct
 import time
 from collections.abc import Callable
@@ -89,7 +88,7 @@ class AgentSession:
         self._engine_ns = 0
         self._on_close = on_close
         self._wait: Wait
-        self._offer = Offer(settings, secrets.token_bytes(16), pid, start_time(pid))
+        self._offer = Offer(settings, os.urandom(16), pid, start_time(pid))
         self._poses = PoseBatch.zeros(lanes)
         self._pose_bytes = layout.flat_bytes(self._poses.raw, POSE_WORDS, lanes, "poses")
         self._commands: CommandBatch | None = None

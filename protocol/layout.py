@@ -53,7 +53,7 @@ class Farewell(IntEnum):
 
     NONE = 0
     STOPPED = 1
-    """It was told to stop: a signal, the user, the end of its program."""
+    """It was told to stop (a signal, the user, the end of its program), or gave up waiting."""
     FAILED = 2
     """An error of its own; the text says which."""
     VIOLATION = 3

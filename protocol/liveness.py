@@ -86,10 +86,17 @@ _EXIT_STATUS: Final = 49
 
 
 def _proc_stat(pid: int) -> list[str]:
+    # Plain system calls: this is called fifty times a second while a session waits.
     try:
-        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-    except (FileNotFoundError, ProcessLookupError):
+        descriptor = os.open(f"/proc/{pid}/stat", os.O_RDONLY)
+    except FileNotFoundError:
         return []
+    try:
+        text = os.read(descriptor, 4096).decode(errors="replace")
+    except ProcessLookupError:
+        return []
+    finally:
+        os.close(descriptor)
     return text[text.rindex(")") + 2 :].split()
 
 

@@ -31,6 +31,7 @@ CREATION_GRACE_S: Final = 0.5
 LOOK_AGAIN_S: Final = 0.005
 _NOT_YET: Final = bytes(8)
 _HEADER_BYTES: Final = 2048
+_DEAD_AGENT: Final = "stale segments of a dead agent"
 
 
 def create_segments(rendezvous: Rendezvous, lanes: int) -> Segments:
@@ -52,51 +53,55 @@ def create_segments(rendezvous: Rendezvous, lanes: int) -> Segments:
 
 
 def _create_over_stale(rendezvous: Rendezvous, suffix: str, size: int, word: bytes) -> Segment:
-    try:
-        return create_segment(rendezvous, suffix, size)
-    except FileExistsError:
-        _remove_stale(rendezvous, suffix, word)
-    try:
-        return create_segment(rendezvous, suffix, size)
-    except FileExistsError:
-        raise SessionError(
-            f"{rendezvous} was taken by another agent at this moment; use another name"
-        ) from None
-
-
-def _remove_stale(rendezvous: Rendezvous, suffix: str, word: bytes) -> None:
-    """Remove a segment whose writer is dead; a pose segment is removed by the agent that holds the command's lock."""
-    segment = open_segment(rendezvous, suffix)
+    """Create a segment, in place of a stale one if need be."""
     patience = time.monotonic() + CREATION_GRACE_S
-    while suffix == COMMAND_SUFFIX and time.monotonic() < patience:
-        if segment is not None and magic(segment.view) != _NOT_YET:
-            break
+    while True:
+        try:
+            return create_segment(rendezvous, suffix, size)
+        except FileExistsError:
+            patient = time.monotonic() < patience
+            obstacle = _remove_stale(rendezvous, suffix, word, patient)
+        if obstacle and not patient:
+            raise SessionError(obstacle)
         time.sleep(LOOK_AGAIN_S)
-        if segment is None:
-            segment = open_segment(rendezvous, suffix)
+
+
+def _remove_stale(rendezvous: Rendezvous, suffix: str, word: bytes, patient: bool) -> str:
+    """Remove a segment whose writer is dead, or return what stands against it for now.
+
+    A pose segment needs no proof of its own: who asks holds the lock of the command segment.
+
+    Raises:
+        SessionError: its writer is alive, or it is no session's segment.
+    """
     name = rendezvous.stem + suffix
-    if segment is None or len(segment.view) < _HEADER_BYTES or magic(segment.view) not in (word, _NOT_YET):
-        if segment is not None:
-            segment.close()
-        raise SessionError(f"{name} exists and is no session's segment; remove it or use another name")
+    foreign = f"{name} exists and is no session's segment; remove it or use another name"
+    segment = open_segment(rendezvous, suffix)
+    if segment is None:  # just created, or just removed by another
+        return foreign
     try:
+        found = magic(segment.view)
+        if len(segment.view) < _HEADER_BYTES or found not in (word, _NOT_YET):
+            raise SessionError(foreign)
         pid, started = owner(segment.view)
-        is_agent = suffix == COMMAND_SUFFIX
-        if is_agent and ((pid and life(pid, started) is not Life.DEAD) or not segment.lock()):
-            raise SessionError(
-                f"{rendezvous} belongs to a session whose agent (pid {pid}) is alive; "
-                "end that one or use another name"
-            )
+        in_use = f"{rendezvous} belongs to a session whose agent (pid {pid}) is alive; use another name"
+        if suffix == COMMAND_SUFFIX:
+            if pid and life(pid, started) is not Life.DEAD:
+                raise SessionError(in_use)
+            if (found == _NOT_YET and patient) or not segment.lock():
+                return in_use
         _log.warning("replacing the stale segment %s; its writer (pid %d) did not remove it", name, pid)
         segment.unlink()
     finally:
         segment.close()
+    return ""
 
 
 def attach_segments(rendezvous: Rendezvous, timeout: float) -> Segments:
     """Wait until an agent offers a session, then open its segments and claim the physics side.
 
-    Segments of an agent that is dead or has said farewell are passed over: a new agent may replace them.
+    Segments of an agent that is dead are removed, those of one that has said farewell passed over: a new agent
+    may come.
 
     Raises:
         PeerLost: no session was offered within `timeout` seconds.
@@ -121,14 +126,17 @@ def _try_attach(rendezvous: Rendezvous) -> tuple[Segments | None, str]:
     command = open_segment(rendezvous, COMMAND_SUFFIX)
     if command is None:
         return None, ""
-    pose = None
+    pose = open_segment(rendezvous, POSE_SUFFIX)
     try:
         news = _not_on_offer(command)
-        if not news:
-            pose = open_segment(rendezvous, POSE_SUFFIX)
-            news = "a command segment without its pose segment"
-        if pose is None:
+        if news == _DEAD_AGENT and command.lock():
+            for segment in (command, pose):
+                if segment is not None:
+                    segment.unlink()
+        if news:
             return None, news
+        if pose is None:
+            return None, "a command segment without its pose segment"
         _claim(rendezvous, pose)
         segments = Segments(command, pose)
         command = pose = None
@@ -149,9 +157,9 @@ def _not_on_offer(command: Segment) -> str:
         return ""
     pid, started = owner(command.view)
     if life(pid, started) is Life.DEAD:
-        return f"stale segments of a dead agent (pid {pid})"
+        return _DEAD_AGENT
     if read_farewell(command.view)[0] != Farewell.NONE:
-        return f"a session that its agent (pid {pid}) has left"
+        return "a session that its agent has left"
     return ""
 
 

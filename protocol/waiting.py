@@ -22,10 +22,10 @@ POLLS: Final = 50
 """Polls of the doorbell before the first yield, about 2 us."""
 YIELDING_S: Final = 0.05
 """How long a wait without progress yields before it begins to sleep."""
-LOOK_S: Final = 0.02
+LOOK_S: Final = 0.03
 """Time between two looks at the peer's process."""
 NAP_MIN_S: Final = 0.001
-NAP_MAX_S: Final = 0.005
+NAP_MAX_S: Final = 0.015
 EXIT_NEWS_S: Final = 0.05
 """How long a launcher is given to learn how its dead child ended."""
 
@@ -74,7 +74,7 @@ class Peer:
         """
         reason, text = read_farewell(self.view)
         if reason != Farewell.NONE:
-            raise farewell_error(self.who, reason, text, step, phase)
+            raise farewell_error(self.name, reason, text, step, phase)
         state = life(self.pid, self.started)
         ended = self.watch() if self.watch is not None else None
         if state is Life.DEAD or ended is not None:

@@ -179,13 +179,19 @@ def test_physics_waits_for_a_header_that_is_being_written(rendezvous: str) -> No
     segments.unlink()
 
 
-def test_physics_passes_over_stale_segments(
-    rendezvous: str, start: Start, resets: Callable[..., ResetBatch], commands: Callable[..., CommandBatch]
+def test_physics_removes_stale_segments_and_waits_on(
+    rendezvous: str,
+    start: Start,
+    resets: Callable[..., ResetBatch],
+    commands: Callable[..., CommandBatch],
+    eventually: Callable[[Callable[[], bool]], None],
 ) -> None:
-    """A physics process that finds the segments of a dead agent waits for a new one to replace them."""
+    """A physics process that finds the segments of a dead agent removes them and waits for a new one."""
     leave_stale(rendezvous, DEAD_PID)
     server = start("serve", rendezvous)
-    time.sleep(0.4)
+    kind, _, stem = rendezvous.partition(":")
+    place = Path("/dev/shm") / stem if kind == "shm" else Path(stem)
+    eventually(lambda: not list(place.parent.glob(f"{place.name}*")))
     with AgentSession.open(rendezvous, SETTINGS, attach_timeout=20.0) as session:
         session.reset(resets())
         assert session.step(commands()).step[0] == 1
@@ -202,7 +208,6 @@ def test_physics_gives_up_when_no_agent_comes(rendezvous: str) -> None:
     leave_stale(rendezvous, DEAD_PID)
     with pytest.raises(PeerLost, match=r"stale segments of a dead agent"):
         serve(rendezvous, ToyPlant(), attach_timeout=0.1)
-    clear(rendezvous)
 
 
 def test_the_agent_gives_up_when_nobody_attaches(rendezvous: str) -> None:
