@@ -32,6 +32,7 @@ LOOK_AGAIN_S: Final = 0.005
 _NOT_YET: Final = bytes(8)
 _HEADER_BYTES: Final = 2048
 _DEAD_AGENT: Final = "stale segments of a dead agent"
+_UNFINISHED: Final = "a header that is not finished"
 
 
 def create_segments(rendezvous: Rendezvous, lanes: int) -> Segments:
@@ -108,28 +109,36 @@ def attach_segments(rendezvous: Rendezvous, timeout: float) -> Segments:
         SessionError: another physics process serves the session or has served it.
         HandshakeError: a segment is too small to be one.
     """
-    began = time.monotonic()
+    began = whole = time.monotonic()
     found = "nothing of that name"
     while True:
-        segments, news = _try_attach(rendezvous)
+        now = time.monotonic()
+        segments, news = _try_attach(rendezvous, patient=now - whole < CREATION_GRACE_S)
         if segments is not None:
             return segments
+        if news != _UNFINISHED:
+            whole = now  # the last moment without a half-written header
         found = news or found
-        if time.monotonic() - began > timeout:
+        if now - began > timeout:
             how = f"no session at {rendezvous} within {timeout} s, found {found}; is the agent running?"
             raise PeerLost("agent", how, Verdict.TOO_SLOW, 0, "attach")
         time.sleep(LOOK_AGAIN_S)
 
 
-def _try_attach(rendezvous: Rendezvous) -> tuple[Segments | None, str]:
-    """Open both segments if a session is on offer now; else say what was found."""
+def _try_attach(rendezvous: Rendezvous, patient: bool) -> tuple[Segments | None, str]:
+    """Open both segments if a session is on offer now; else say what was found.
+
+    Removes what a dead agent left, and a header that stays unfinished once the patience with it is over; an
+    agent that is writing one holds its lock.
+    """
     command = open_segment(rendezvous, COMMAND_SUFFIX)
     if command is None:
         return None, ""
     pose = open_segment(rendezvous, POSE_SUFFIX)
     try:
         news = _not_on_offer(command)
-        if news == _DEAD_AGENT and command.lock():
+        abandoned = news == _DEAD_AGENT or (news == _UNFINISHED and not patient)
+        if abandoned and command.lock():
             for segment in (command, pose):
                 if segment is not None:
                     segment.unlink()
@@ -152,7 +161,7 @@ def _not_on_offer(command: Segment) -> str:
     _check_header_fits(command)
     word = magic(command.view)
     if word == _NOT_YET:
-        return "a header that is not finished"
+        return _UNFINISHED
     if word != COMMAND_MAGIC:  # left to the handshake, which names what it found
         return ""
     pid, started = owner(command.view)

@@ -179,15 +179,17 @@ def test_physics_waits_for_a_header_that_is_being_written(rendezvous: str) -> No
     segments.unlink()
 
 
+@pytest.mark.parametrize("magic", [b"TUBE.CMD", bytes(8)])
 def test_physics_removes_stale_segments_and_waits_on(
     rendezvous: str,
+    magic: bytes,
     start: Start,
     resets: Callable[..., ResetBatch],
     commands: Callable[..., CommandBatch],
     eventually: Callable[[Callable[[], bool]], None],
 ) -> None:
     """A physics process that finds the segments of a dead agent removes them and waits for a new one."""
-    leave_stale(rendezvous, DEAD_PID)
+    leave_stale(rendezvous, DEAD_PID, magic=magic)
     server = start("serve", rendezvous)
     kind, _, stem = rendezvous.partition(":")
     place = Path("/dev/shm") / stem if kind == "shm" else Path(stem)
