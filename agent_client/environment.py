@@ -48,6 +48,7 @@ class TubeVecEnv(VecEnv):
         curriculum: Curriculum,
         settings: Settings,
         seed: int,
+        centring: float = 0.0,
     ) -> None:
         """Put the lanes of an open session into tubes.
 
@@ -57,6 +58,7 @@ class TubeVecEnv(VecEnv):
             curriculum: draws the level of each episode, and is told how it ended.
             settings: constants of the task.
             seed: of starts and of the choice of tubes.
+            centring: weight of S_center in what the learner is rewarded with, see `_shape`; 0 is the paper's.
         """
         self.render_mode = None
         lanes = session.lanes
@@ -68,6 +70,7 @@ class TubeVecEnv(VecEnv):
         self.session: Final = session
         self.curriculum: Final = curriculum
         self._settings = settings
+        self._centring = centring
         self._geometry = SweptGeometry([tube for pool in pools for tube in pool], lanes)
         self._sizes = [len(pool) for pool in pools]
         self._first = np.concatenate([[0], np.cumsum(self._sizes)]).tolist()
@@ -82,7 +85,8 @@ class TubeVecEnv(VecEnv):
         self._returns = np.zeros(lanes)
         self._actions: Ints = np.zeros(lanes, dtype=np.int64)
         self._rng = np.random.default_rng(seed)
-        self._step: TaskStep
+        self.last: TaskStep
+        """Everything about the lanes after the last step or reset."""
 
     def reset(self) -> Singles:
         """Begin new episodes in all lanes; after `seed(n)` the same ones every time."""
@@ -101,12 +105,12 @@ class TubeVecEnv(VecEnv):
         Returns:
             Observations (N, 37), scaled rewards (N,), done (N,), infos.
         """
-        decode(self._actions, self._step.frame, self._table.local, self._table.speed, self._commands.raw)
+        decode(self._actions, self.last.frame, self._table.local, self._table.speed, self._commands.raw)
         poses = self.session.step(self._commands)
-        step = self._step = self._task.observe(poses)
+        step = self.last = self._task.observe(poses)
         self._returns += step.reward
         done = step.outcome != Outcome.RUNNING
-        rewards = (REWARD_SCALE * step.reward).astype(np.float32)
+        rewards = self._shape(step)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         ended = np.flatnonzero(done)
         if not len(ended):
@@ -140,6 +144,18 @@ class TubeVecEnv(VecEnv):
         """No lane is wrapped."""
         return [False for _ in self._get_indices(indices)]
 
+    def _shape(self, step: TaskStep) -> Singles:
+        """The learner's rewards (N,): the task's, scaled, and on top what `centring` pays for flying mid-tube.
+
+        Our departure from the paper, which defines S_traj = (S_center + S_align) / 2 and judges by it, but whose
+        reward holds S_align alone: a policy that cuts corners loses 2 % of it. S_center is paid like the other
+        terms by the way flown, though never by more than v_max dt, which a corner cut would exceed.
+        """
+        reward = step.reward
+        if self._centring > 0.0:
+            reward = reward + self._centring * step.centring * np.minimum(step.episodes["gain"], 1.0)
+        return (REWARD_SCALE * reward).astype(np.float32)
+
     def _begin(self, lanes: Ints) -> Singles:
         """Draw level, tube and start of new episodes in `lanes`; returns the observations of all lanes."""
         rng = self._rng
@@ -149,12 +165,12 @@ class TubeVecEnv(VecEnv):
         self._returns[lanes] = 0.0
         draw_starts(self._resets, lanes, self._geometry, self._settings.start, rng)
         poses = self.session.reset(self._resets)
-        self._step = self._task.begin(lanes, poses)
-        return self._step.observation.copy()
+        self.last = self._task.begin(lanes, poses)
+        return self.last.observation.copy()
 
     def _conclude(self, lane: int) -> dict[str, Any]:
         """Tell the curriculum how the episode of a lane ended, and say it in an info."""
-        step = self._step
+        step = self.last
         outcome = Outcome(int(step.outcome[lane]))
         level = int(self._level[lane])
         self.curriculum.record(level, outcome is Outcome.SUCCESS)

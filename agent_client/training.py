@@ -84,6 +84,8 @@ class TrainingOptions:
     """Tubes of each level, drawn from training's domain before the first step."""
     replay: float = 0.0
     """Share of episodes from earlier levels (`agent_client.curriculum`)."""
+    centring: float = 0.0
+    """Weight of S_center in the reward while training; 0 is the paper's (`agent_client.environment`)."""
     threads: int = 1
     """Torch's threads. The policy's bits depend on it."""
     save_every: int = 10
@@ -125,6 +127,7 @@ def shipped_options(out: Path, steps: int = 2_000_000, seed: int = 1) -> Trainin
         settings=Settings(masked_features=UNKNOWN_TUBE),
         tubes=VARIED_TUBES,
         replay=0.3,
+        centring=3.0,
     )
 
 
@@ -151,7 +154,7 @@ def train(
     pools = [draw_pool(level, options.seed, options.pool, options.tubes) for level in range(LEVELS)]
     curriculum = Curriculum(replay=options.replay)
     with opener(session_settings) as session:
-        tubes = TubeVecEnv(session, pools, curriculum, options.settings, options.seed)
+        tubes = TubeVecEnv(session, pools, curriculum, options.settings, options.seed, options.centring)
         env = VecNormalize(
             tubes,
             norm_reward=False,
@@ -287,6 +290,7 @@ class _Watcher(BaseCallback):
                 "dynamics": self._engine,
                 "level": self._curriculum.level,
                 "replay": options.replay,
+                "centring": options.centring,
                 "tubes": asdict(options.tubes),
                 "hyperparameters": asdict(hyper),
                 "versions": {

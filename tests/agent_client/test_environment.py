@@ -98,6 +98,28 @@ def test_the_return_is_the_sum_of_unscaled_rewards(env: TubeVecEnv) -> None:
     assert ended > 0
 
 
+def test_centring_pays_for_flying_in_the_middle(env: TubeVecEnv) -> None:
+    """With a weight, the learner's reward is the task's plus weight x S_center x way flown over v_max dt."""
+    shaped = TubeVecEnv(env.session, make_pools(), Curriculum(), Settings(), seed=3, centring=2.0)
+    actions = np.full(LANES, 3)
+    before = None
+    plain_rewards = []
+    env.seed(1)
+    env.reset()
+    for _ in range(4):
+        plain_rewards.append(env.step(actions)[1])
+    shaped.seed(1)
+    shaped.reset()
+    for plain in plain_rewards:
+        reward = shaped.step(actions)[1]
+        step = shaped.last
+        if before is not None:
+            share = np.minimum((step.axis.arc_length - before) / 0.2, 1.0)
+            expected = plain + REWARD_SCALE * 2.0 * step.centring * share
+            np.testing.assert_allclose(reward, expected, atol=1e-6)
+        before = step.axis.arc_length.copy()
+
+
 def test_the_same_seed_gives_the_same_episodes(env: TubeVecEnv) -> None:
     """After the same seed, the same actions give the same observations and rewards to the last bit."""
     env.seed(11)
