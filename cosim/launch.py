@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import click
 
+from agent_client.episodes import episode_dtype
 from agent_client.flight import FlightResult, FlightStep, fly
 from agent_client.settings import max_steps
 from agent_client.task import Outcome
@@ -97,7 +98,7 @@ def _fly_recorded(
     manifest: dict[str, Any],
 ) -> dict[str, Any]:
     """Fly with a recording that is closed whatever happens, and return the report."""
-    recorder = Recorder(folder, manifest, 2 * pilot.settings.lidar.rays)
+    recorder = Recorder(folder, manifest, episode_dtype(pilot.settings.lidar.rays))
     status, report = "failed", dict[str, Any]()
     try:
         with LiveLine() as live:

@@ -101,6 +101,7 @@ def rays_microseconds(tube: Tube, records: NDArray[np.void], rays: int, reach: f
     angle = np.linspace(0.0, 2.0 * np.pi, rays, endpoint=False)
     directions = np.stack([np.zeros(rays), np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
     origins = [np.tile((row["position"] - centre).astype(np.float32), (rays, 1)) for row in records[1:]]
+    scene.run(origins[0], directions, dists=reach, query="DISTANCE")  # the first call builds the scene
     started = time.perf_counter()
     for at in origins:
         scene.run(at, directions, dists=reach, query="DISTANCE")

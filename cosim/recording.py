@@ -33,70 +33,109 @@ POSE_BYTES: Final = 8 * POSE_WORDS
 
 @dataclass(frozen=True)
 class Column:
-    """One field of a record: name, numpy type, shape, unit and frame."""
+    """One field of a record: where it stands, its numpy type and shape, and what it means."""
 
     name: str
     type: str
-    shape: tuple[int, ...] = ()
-    unit: str = "1"
-    frame: str = ""
-    labels: tuple[str, ...] = ()
-    """Names of the elements, where they are not x, y, z."""
+    shape: tuple[int, ...]
+    offset: int
+    """First byte within the record."""
+    unit: str
+    frame: str
+    labels: tuple[str, ...]
+    """Names of the elements; of three without names they are x, y, z."""
 
 
-def columns(lidar_rays: int) -> tuple[Column, ...]:
-    """The fields of one record, in the order of their bytes: command row, pose row, then what came of them.
+_Field = tuple[str, str, tuple[int, ...], str, str, tuple[str, ...]]
+
+PAYLOAD: Final[tuple[_Field, ...]] = (
+    ("direction", "<f8", (3,), "1", "world", ()),
+    ("commanded_speed", "<f8", (), "m/s", "", ()),
+    ("compensation", "<f8", (), "weight", "", ()),
+    ("command_reserved", "<f8", (3,), "1", "", ("0", "1", "2")),
+    ("position", "<f8", (3,), "m", "world", ()),
+    ("quaternion", "<f8", (4,), "1", "body to world", ("x", "y", "z", "w")),
+    ("linear_velocity", "<f8", (3,), "m/s", "world", ()),
+    ("angular_velocity", "<f8", (3,), "rad/s", "world", ()),
+    ("sim_time", "<f8", (), "s", "", ()),
+    ("contact_steps", "<i8", (), "inner steps", "", ()),
+    ("step", "<i8", (), "control steps", "", ()),
+)
+"""Command row and pose row as they crossed the protocol (`protocol.plant`)."""
+
+ADDED: Final[tuple[_Field, ...]] = (
+    ("chain", "|u1", (32,), "1", "", ()),
+    ("action", "<i8", (), "index", "", ()),
+    ("phases", "<i8", (len(PHASES),), "ns", "", PHASES),
+    ("recording", "<i8", (), "ns", "of the record before", ()),
+    ("observation", "<f4", (len(FEATURES),), "1", "", FEATURE_NAMES),
+)
+"""What the flight adds: link of the hash chain, action (-1: none of the table), timings, observation."""
+
+EPISODE: Final[dict[str, tuple[str, str, tuple[str, ...]]]] = {
+    "reward": ("1", "", ()),
+    "reward_terms": ("1", "", TERMS),
+    "regime": ("1 visible, 2 memory, 3 blind", "", ()),
+    "outcome": ("0 running, 1 success, 2 exit, 3 collision, 4 timeout", "", ()),
+    "inside": ("1", "", ()),
+    "contact": ("1", "", ()),
+    "arc_length": ("m", "axis", ()),
+    "axis_position": ("m", "world", ()),
+    "tangent": ("1", "world", ()),
+    "radial_distance": ("m", "", ()),
+    "radius": ("m", "", ()),
+    "clearance": ("m", "centre of the drone to the wall", ()),
+    "progress": ("1", "", ()),
+    "lidar": ("m", "front ring, then rear ring", ()),
+    "target_visible": ("1", "", ()),
+    "target_position": ("m", "world", ()),
+    "memory_available": ("1", "", ()),
+    "memory_direction": ("1", "world", ()),
+    "memory_age": ("control steps", "", ()),
+    "centring": ("1", "", ()),
+    "alignment": ("1", "", ()),
+    "quality": ("1", "so far", ()),
+    "C_turn": ("1", "", ()),
+}
+"""Unit, frame and labels of what is told of the episode's own record (`agent_client.episodes`), which stands
+whole at the end of every record: one copy in place of twenty."""
+
+
+def columns(episode: np.dtype[np.void]) -> tuple[Column, ...]:
+    """The fields of one record, by their offsets: command and pose, what the flight adds, the episode.
 
     Args:
-        lidar_rays: rays of both rings together.
+        episode: dtype of the episode's own record.
     """
-    return (
-        Column("direction", "<f8", (3,), "1", "world"),
-        Column("speed", "<f8", (), "m/s"),
-        Column("compensation", "<f8", (), "weight"),
-        Column("command_reserved", "<f8", (3,), labels=("0", "1", "2")),
-        Column("position", "<f8", (3,), "m", "world"),
-        Column("quaternion", "<f8", (4,), "1", "body to world", ("x", "y", "z", "w")),
-        Column("linear_velocity", "<f8", (3,), "m/s", "world"),
-        Column("angular_velocity", "<f8", (3,), "rad/s", "world"),
-        Column("sim_time", "<f8", (), "s"),
-        Column("contact_steps", "<i8", (), "inner steps"),
-        Column("step", "<i8", (), "control steps"),
-        Column("chain", "|u1", (32,)),
-        Column("observation", "<f4", (len(FEATURES),), labels=FEATURE_NAMES),
-        Column("action", "<i8"),
-        Column("reward", "<f8"),
-        Column("reward_terms", "<f8", (len(TERMS),), labels=TERMS),
-        *TASK_COLUMNS,
-        Column("lidar", "<f8", (lidar_rays,), "m", "front ring, then rear ring"),
-        Column("phases", "<i8", (len(PHASES),), "ns", labels=PHASES),
-        Column("recording", "<i8", (), "ns", "of the record before"),
+    found = []
+    offset = 0
+    for name, kind, shape, unit, frame, labels in (*PAYLOAD, *ADDED):
+        found.append(Column(name, kind, shape, offset, unit, frame, labels))
+        offset += np.dtype((kind, shape)).itemsize
+    start = _episode_offset()
+    assert episode.fields is not None
+    for name, (unit, frame, labels) in EPISODE.items():
+        field, at = episode.fields[name][:2]
+        found.append(Column(name, field.base.str, field.shape, start + at, unit, frame, labels))
+    return tuple(found)
+
+
+def _episode_offset() -> int:
+    """Where the episode's record begins: after all else, on a boundary of 8 bytes."""
+    packed = sum(np.dtype((kind, shape)).itemsize for _, kind, shape, *_ in (*PAYLOAD, *ADDED))
+    return -(-packed // 8) * 8
+
+
+def record_dtype(fields: tuple[Column, ...], size: int) -> np.dtype[np.void]:
+    """The dtype of a record of `size` bytes with these fields."""
+    return np.dtype(
+        {
+            "names": [c.name for c in fields],
+            "formats": [(c.type, c.shape) for c in fields],
+            "offsets": [c.offset for c in fields],
+            "itemsize": size,
+        }
     )
-
-
-TASK_COLUMNS: Final = (
-    Column("regime", "|i1"),
-    Column("outcome", "|i1"),
-    Column("inside", "|b1"),
-    Column("contact", "|b1"),
-    Column("target_visible", "|b1"),
-    Column("memory_available", "|b1"),
-    Column("target_position", "<f8", (3,), "m", "world"),
-    Column("memory_direction", "<f8", (3,), "1", "world"),
-    Column("arc_length", "<f8", (), "m"),
-    Column("radial_distance", "<f8", (), "m"),
-    Column("radius", "<f8", (), "m"),
-    Column("clearance", "<f8", (), "m", "centre of the drone to the wall"),
-    Column("progress", "<f8"),
-    Column("alignment", "<f8"),
-    Column("quality", "<f8"),
-)
-"""What is copied from the episode's own record (`agent_client.task.TaskStep` explains it) under its own name."""
-
-
-def record_dtype(fields: tuple[Column, ...]) -> np.dtype[np.void]:
-    """The packed little-endian dtype of a record."""
-    return np.dtype([(c.name, c.type, c.shape) for c in fields])
 
 
 def next_link(chain: bytes, payload: bytes) -> bytes:
@@ -107,30 +146,33 @@ def next_link(chain: bytes, payload: bytes) -> bytes:
 class Recorder:
     """Writes one flight of one lane, flushed at least every second, so that a crash loses no more.
 
+    Args:
+        folder: the run folder, without a run in it.
+        manifest: what is known before the first step.
+        episode: dtype of the episode's own record.
+
     Raises:
         OutputError: the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, manifest: dict[str, Any], lidar_rays: int) -> None:
+    def __init__(self, folder: Path, manifest: dict[str, Any], episode: np.dtype[np.void]) -> None:
         self.folder = folder
-        fields = columns(lidar_rays)
-        self._row = np.zeros(1, record_dtype(fields))
-        words = self._row.view(np.uint8)[: COMMAND_BYTES + POSE_BYTES]
-        self._payload = words
-        self._command = words.view(np.float64)[:COMMAND_WORDS]
-        self._pose = words.view(np.float64)[COMMAND_WORDS:]
-        row = self._row[0]
-        self._chain_bytes, self._observation = row["chain"], row["observation"]
-        self._reward_terms, self._lidar, self._phases = row["reward_terms"], row["lidar"], row["phases"]
-        names = [column.name for column in TASK_COLUMNS]
-        self._task, self._names = self._row[names], names
+        fields = columns(episode)
+        size = _episode_offset() + episode.itemsize
+        self._row = np.zeros(1, record_dtype(fields, size))
+        row, words = self._row[0], self._row.view(np.uint8)
+        self._payload = words[: COMMAND_BYTES + POSE_BYTES]
+        self._command = self._payload.view(np.float64)[:COMMAND_WORDS]
+        self._pose = self._payload.view(np.float64)[COMMAND_WORDS:]
+        self._link, self._phases, self._observation = row["chain"], row["phases"], row["observation"]
+        self._action, self._recording = self._row["action"], self._row["recording"]
+        self._record, self._episode = memoryview(words), words[_episode_offset() :]
         self._chain = b""
         self.records = 0
-        self.recording_ns = 0
-        """Time spent in `write` so far."""
         self.manifest = manifest | {
             "format": FORMAT,
             "log": LOG,
+            "record_bytes": size,
             "record": [asdict(column) for column in fields],
             "status": "running",
         }
@@ -149,24 +191,20 @@ class Recorder:
     def write(self, step: FlightStep) -> None:
         """Append one control step, or the reset pose as the first record."""
         started = time.perf_counter_ns()
-        task, row = step.task, self._row
         self._command[:] = step.command[0]
         self._pose[:] = step.pose[0]
         self._chain = next_link(self._chain, self._payload.tobytes())
-        self._chain_bytes[:] = np.frombuffer(self._chain, np.uint8)
-        self._observation[:] = task.observation[0]
-        self._reward_terms[:] = task.reward_terms[0]
-        self._lidar[:] = task.lidar[0]
+        self._link[:] = np.frombuffer(self._chain, np.uint8)
+        self._action[0] = step.actions[0]
         self._phases[:] = step.phases
-        row["action"], row["reward"] = step.actions[0], task.reward[0]
-        for name in self._names:
-            row[name] = task.episodes[name]
-        self._log.write(row.tobytes())
+        self._observation[:] = step.task.observation[0]
+        # As bytes: copied field by field it would take ten times as long.
+        self._episode[:] = step.task.episodes.view(np.uint8)
+        self._log.write(self._record)
         self.records += 1
         if time.monotonic() - self._flushed > FLUSH_SECONDS:
             self.flush()
-        row["recording"] = spent = time.perf_counter_ns() - started  # of the record before
-        self.recording_ns += spent
+        self._recording[0] = time.perf_counter_ns() - started
 
     def flush(self) -> None:
         """Hand what is buffered to the operating system: it survives the death of this process."""
@@ -188,5 +226,6 @@ class Recorder:
         self._log.close()
         self.manifest["status"] = status
         self.manifest["records"] = self.records
+        self.manifest["trajectory_hash"] = self.trajectory_hash
         self.manifest["outcome"] = outcome
         self.write_manifest()

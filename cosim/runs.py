@@ -47,9 +47,9 @@ def read_run(folder: Path) -> Run:
             for c in manifest["record"]
         )
         log = folder / manifest["log"]
-    except (KeyError, TypeError) as error:
+        dtype = record_dtype(columns, manifest["record_bytes"])
+    except (KeyError, TypeError, ValueError) as error:
         raise RunError(f"{path}: the description of a record is damaged ({error})") from error
-    dtype = record_dtype(columns)
     try:
         count = log.stat().st_size // dtype.itemsize
         records = np.memmap(log, dtype, mode="r", shape=(count,)) if count else np.zeros(0, dtype)

@@ -48,6 +48,7 @@ class MeshGeometry(Geometry):
         self._axis_position = np.empty((lanes, 3))
         self._axis_tangent = np.empty((lanes, 3))
         self._clearance = np.empty(lanes)
+        self._nearest_triangle = np.full(lanes, -1)
         self.assigned = np.arange(lanes, dtype=np.int64) % len(tubes)
         self.assign(np.arange(lanes), self.assigned)
 
@@ -63,6 +64,7 @@ class MeshGeometry(Geometry):
                 f"expected tube indices from 0 to {len(self._scenes) - 1}, found {indices.tolist()}"
             )
         self.assigned[np.asarray(lanes)] = indices
+        self._nearest_triangle[np.asarray(lanes)] = -1
         self._first = self._firsts[self.assigned]
         self._count = self._counts[self.assigned]
         self._step = self._steps[self.assigned]
@@ -138,12 +140,13 @@ class MeshGeometry(Geometry):
         clearance = self._clearance
         if len(self._groups) == 1:
             tree = self._trees[self._groups[0][0]]
-            wall_distance(_contiguous(points), tree.boxes, tree.triangles, clearance)
+            wall_distance(_contiguous(points), tree.boxes, tree.triangles, self._nearest_triangle, clearance)
         else:
             for tube, lanes in self._groups:
                 tree, distances = self._trees[tube], np.empty(len(lanes))
-                wall_distance(points[lanes], tree.boxes, tree.triangles, distances)
-                clearance[lanes] = distances
+                nearest = self._nearest_triangle[lanes]
+                wall_distance(points[lanes], tree.boxes, tree.triangles, nearest, distances)
+                clearance[lanes], self._nearest_triangle[lanes] = distances, nearest
         free = self._between_ends(points, axis_points)
         # A wall farther away than the axis point cannot lie between: most points need no ray.
         if not (axis_points.radial_distance < clearance).all():

@@ -20,7 +20,7 @@ def distances(vertices: Floats, faces: Any, points: Floats) -> Floats:
     """Through a tree."""
     tree = build_tree(vertices, np.asarray(faces, dtype=np.int32))
     found = np.empty(len(points))
-    wall_distance(points, tree.boxes, tree.triangles, found)
+    wall_distance(points, tree.boxes, tree.triangles, np.full(len(points), -1), found)
     return found
 
 
@@ -49,6 +49,20 @@ def test_soup_agrees_with_brute_force(faces: int) -> None:
     np.testing.assert_allclose(
         distances(vertices, indices, points), brute_force(vertices, indices, points), rtol=1e-9, atol=1e-9
     )
+
+
+def test_the_triangle_that_it_begins_with_changes_nothing() -> None:
+    """From whichever triangle a search begins, it ends with the same bits, and at a nearest triangle."""
+    rng = np.random.default_rng(7)
+    vertices, faces = rng.normal(size=(120, 3)), np.arange(120, dtype=np.int32).reshape(-1, 3)
+    tree = build_tree(vertices, faces)
+    points = np.tile(rng.normal(size=3), (41, 1))
+    nearest, found = np.arange(-1, 40), np.empty(41)
+    wall_distance(points, tree.boxes, tree.triangles, nearest, found)
+    assert len(set(found.tolist())) == 1
+    again = np.empty(41)
+    wall_distance(points, tree.boxes, tree.triangles, nearest, again)
+    assert np.array_equal(found, again)
 
 
 @given(st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=4, max_size=4))
