@@ -118,12 +118,13 @@ OpenSession = Callable[[SessionSettings], AgentSession]
 
 
 def shipped_options(out: Path, steps: int = 2_000_000, seed: int = 1) -> TrainingOptions:
-    """The recipe of the shipped policy: tubes of many widths and lengths, and no knowledge of the tube."""
+    """The recipe of the shipped policy: tubes of many widths and lengths, mid-tube, without knowing the tube."""
     return TrainingOptions(
         out,
         steps=steps,
         seed=seed,
         preset="shipped",
+        hyperparameters=Hyperparameters(final_learning_rate=3e-5),
         settings=Settings(masked_features=UNKNOWN_TUBE),
         tubes=VARIED_TUBES,
         replay=0.3,
@@ -176,7 +177,7 @@ def _make_model(env: VecNormalize, options: TrainingOptions) -> PPO:
     return PPO(
         "MlpPolicy",
         env,
-        learning_rate=first if first == last else LinearRate(first, last),
+        learning_rate=first if first == last else _LinearRate(first, last),
         n_steps=hyper.rollout,
         batch_size=hyper.minibatch,
         n_epochs=hyper.epochs,
@@ -195,8 +196,8 @@ def _make_model(env: VecNormalize, options: TrainingOptions) -> PPO:
 
 
 @dataclass(frozen=True)
-class LinearRate:
-    """A learning rate that goes linearly from `first` to `last`; a class, so that it can be pickled by name."""
+class _LinearRate:
+    """A learning rate that goes linearly from `first` to `last`."""
 
     first: float
     last: float
@@ -208,9 +209,10 @@ class LinearRate:
 
 _NOT_THE_POLICY: Final = (
     "ep_info_buffer", "ep_success_buffer", "tensorboard_log", "start_time",
-    "_last_obs", "_last_original_obs", "_last_episode_starts",
+    "_last_obs", "_last_original_obs", "_last_episode_starts", "learning_rate", "lr_schedule",
 )  # fmt: skip
-"""Attributes of the model that are no part of a checkpoint: statistics, clocks, paths and the last step."""
+"""Attributes of the model that are no part of a checkpoint: statistics, clocks, paths, the last step, and the
+schedule of the learning rate, whose class a reader might not have (the contract has its numbers)."""
 
 
 class _Watcher(BaseCallback):
