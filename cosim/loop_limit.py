@@ -57,7 +57,7 @@ def physics_microseconds(tube: Tube, records: NDArray[np.void], inner_steps: int
             body, start["position"].tolist(), start["quaternion"].tolist(), physicsClientId=client
         )
         commands = [
-            (*row["direction"].tolist(), float(row["speed"]), float(row["compensation"]))
+            (*row["direction"].tolist(), float(row["commanded_speed"]), float(row["compensation"]))
             for row in records[1:]
         ]
         started = time.perf_counter()
