@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ pytest.importorskip("stable_baselines3", reason="the extra 'train' is not instal
 import gymnasium
 import torch
 from gymnasium import spaces
-from stable_baselines3 import PPO
+from stable_baselines3 import DQN, PPO
 
 from agent_client.checkpoint import read_checkpoint
 from agent_client.contract import Normalisation, require_match, running_contract
@@ -128,6 +129,45 @@ def test_a_plain_model_of_other_spaces_is_refused(tmp_path: Path, features: int,
         PolicyError, match=rf"Box\(37,\).*Discrete\(36\).*\({features},\).*Discrete\({actions}\)"
     ):
         load_policy(tmp_path / "other.zip")
+
+
+def test_another_network_is_refused(tmp_path: Path) -> None:
+    """An actor that is no chain of tanh or relu layers is refused with what is expected."""
+    kwargs = {"activation_fn": torch.nn.ELU}
+    PPO("MlpPolicy", Blank(), device="cpu", policy_kwargs=kwargs).save(tmp_path / "elu.zip")
+    with pytest.raises(PolicyError, match="dense layers and one activation, tanh or relu"):
+        load_policy(tmp_path / "elu.zip")
+
+
+def test_what_only_looks_like_a_model_is_refused(tmp_path: Path) -> None:
+    """A .zip with the right entries and nothing in them, and another algorithm's model, are refused."""
+    with zipfile.ZipFile(tmp_path / "hollow.zip", "w") as archive:
+        archive.writestr("data", "{}")
+        archive.writestr("policy.pth", b"")
+    DQN("MlpPolicy", Blank(), device="cpu", buffer_size=10).save(tmp_path / "dqn.zip")
+    for name in ("hollow.zip", "dqn.zip"):
+        with pytest.raises(PolicyError, match=rf"{name}: expected a PPO policy of stable-baselines3"):
+            load_policy(tmp_path / name)
+
+
+def test_tensorboard_logs_are_written_where_wanted(tmp_path: Path) -> None:
+    """With a folder given, event files appear in it; without one, nothing but the checkpoint is written."""
+    train(options(tmp_path / "a.zip", tensorboard=tmp_path / "logs", steps=64))
+    assert list((tmp_path / "logs").rglob("events.out.tfevents.*"))
+
+
+def test_a_training_that_fails_leaves_the_old_checkpoint(tmp_path: Path) -> None:
+    """A run that is stopped keeps the last checkpoint whole, and leaves no half-written file beside it."""
+    path = train(options(tmp_path / "a.zip"))
+    before = path.read_bytes()
+
+    def stop(progress: Progress) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(options(tmp_path / "a.zip", seed=9), stop)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["a.zip"]
 
 
 def test_a_plain_model_without_torch_says_what_to_install(
