@@ -74,6 +74,8 @@ class Policy:
         self._work = np.zeros((2, int(self._sizes.max())), dtype=np.float32)
         self._logits = np.zeros((1, ACTIONS), dtype=np.float32)
         self._actions = np.zeros(1, dtype=np.int64)
+        # Loads compiled code now, which would else hold up the first control step by some ten milliseconds.
+        self.act(np.zeros((1, FEATURES), dtype=np.float32))
 
     def act(self, observations: Floats32) -> Ints:
         """Choose the most likely action of each lane, (N,); the lowest index among equals.

@@ -119,6 +119,7 @@ def _fly_recorded(
         status, report = "completed", _report(result, recorder, pilot, observer)
     except (KeyboardInterrupt, Terminated):
         status = "interrupted"
+        click.echo(f"interrupted after {recorder.records} records, which are saved in {folder}", err=True)
         raise
     finally:
         recorder.close(status, report)
