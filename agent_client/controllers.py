@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from agent_client.actions import action_table, decode
 from agent_client.errors import SettingsError
-from agent_client.features import FEATURES
 from agent_client.settings import Settings
 from agent_client.task import TaskStep
 from meshes.geometry import Geometry
@@ -57,8 +56,6 @@ class PolicyController(Controller):
     def __init__(self, policy: ActingPolicy, settings: Settings) -> None:
         self.policy: Final = policy
         self._table = action_table(settings)
-        # Loads compiled code now, which would else hold up the first control step by some ten milliseconds.
-        policy.act(np.zeros((1, len(FEATURES)), dtype=np.float32))
 
     def act(self, step: TaskStep, commands: CommandBatch, actions: Ints) -> None:
         """Ask the policy, and turn its actions from the local frame into the world's."""
