@@ -1,5 +1,5 @@
 # Two commands set everything up: `make launch` (fly) and `make test` (develop). Both are quick the second time.
-PYTHON ?= python3.11
+PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3.11)
 VENV   := .venv
 BIN    := $(VENV)/bin
 PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
@@ -29,7 +29,7 @@ clean:
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:
-	@command -v $(PYTHON) >/dev/null || { echo "make: Python 3.11 is needed and '$(PYTHON)' was not found; name one with make PYTHON=..." >&2; exit 2; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "make: Python 3.11 or later is needed, found '$(PYTHON)'; name another with make PYTHON=..." >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 
 # What flying needs and no more: no torch, no vedo.

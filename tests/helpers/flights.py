@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-DEADLINE = 90.0
+DEADLINE = 240.0
 """Seconds after which a subprocess of a test is given up: compiling may be part of it."""
 
 

@@ -1,0 +1,62 @@
+"""The other commands: help, training, benchmarks."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from flights import run_cosim
+
+ROUND_TRIPS = {"shm_two_cores", "shm_one_core", "pipe", "udp", "udp_one_core"}
+QUANTILES = {"p50_us", "p99_us", "p999_us"}
+PHASES = {"wait", "physics", "rays", "features", "policy", "recording", "other"}
+
+
+@pytest.mark.parametrize("command", ["launch", "train", "export", "bench"])
+def test_help_says_how_to_call_a_command(command: str, tmp_path: Path) -> None:
+    """Every command has a page of help that fits a screen's width."""
+    done = run_cosim(command, "--help", cwd=tmp_path)
+    assert done.status == 0
+    assert done.stdout.startswith("Usage:")
+    assert max(map(len, done.stdout.splitlines())) <= 110
+
+
+def test_an_unknown_command_is_bad_usage(tmp_path: Path) -> None:
+    """Usage errors exit with 2 and name what was not understood."""
+    done = run_cosim("fly", cwd=tmp_path)
+    assert done.status == 2
+    assert "fly" in done.stderr
+
+
+def test_a_policy_trained_by_the_command_can_be_flown(tmp_path: Path, session_name: str) -> None:
+    """`cosim train` writes a checkpoint with its contract, which `cosim launch` takes."""
+    pytest.importorskip("stable_baselines3", reason="the extra 'train' is not installed")
+    trained = run_cosim("train", "--steps", "1600", "--envs", "4", "--out", str(tmp_path), cwd=tmp_path)
+    assert trained.status == 0, trained.stderr
+    checkpoint = tmp_path / "policy.zip"
+    assert trained.stdout.strip() == str(checkpoint)
+    flown = run_cosim(
+        "launch", "--json", "--policy", str(checkpoint), "--max-steps", "5", "--session", session_name,
+        "--out", str(tmp_path / "run"), cwd=tmp_path,
+    )  # fmt: skip
+    assert flown.status == 0, flown.stderr
+    assert flown.report["steps"] <= 5
+    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
+    assert manifest["policy"]["training"]["preset"] == "shipped"
+
+
+def test_bench_reports_every_figure(tmp_path: Path) -> None:
+    """`cosim bench --json` prints one object with the promised keys, all of them positive times and ratios."""
+    done = run_cosim("bench", "--json", "--quick", cwd=tmp_path)
+    assert done.status == 0, done.stderr
+    assert len(done.stdout.splitlines()) == 1
+    report = done.report
+    assert set(report["round_trip"]) == ROUND_TRIPS
+    for row in report["round_trip"].values():
+        assert set(row) == QUANTILES
+        assert 0.0 < row["p50_us"] <= row["p99_us"] <= row["p999_us"]
+    assert set(report["loop"]["phases_us"]) == PHASES
+    assert report["loop"]["steps_per_second"] > 0.0
+    assert report["loop"]["ratio_to_limit"] > 0.0
+    assert report["startup_s"] > 0.0
