@@ -166,7 +166,7 @@ class Recorder:
         self._pose = self._payload.view(np.float64)[COMMAND_WORDS:]
         self._link, self._phases, self._observation = row["chain"], row["phases"], row["observation"]
         self._action, self._recording = self._row["action"], self._row["recording"]
-        self._record, self._episode = memoryview(words), words[_episode_offset() :]
+        self._record, self._episode = words.data, words[_episode_offset() :]
         self._chain = b""
         self.records = 0
         self.manifest = manifest | {

@@ -103,5 +103,6 @@ def test_launching_the_shipped_policy_imports_no_learning_library() -> None:
         "heavy = {'torch', 'stable_baselines3', 'gymnasium', 'vedo', 'trimesh', 'pybullet'}\n"
         "print(sorted(heavy & set(sys.modules)))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=60)
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT, timeout=60)
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
