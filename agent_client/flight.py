@@ -28,7 +28,11 @@ and lines of sight; features: all other perception, judgement and reward; policy
 
 @dataclass
 class FlightStep:
-    """One control step of all lanes, as `on_step` sees it: the same object and arrays at every call."""
+    """One control step of all lanes, as `on_step` sees it: the same object and arrays at every call.
+
+    `on_step` sees step k while physics already works on step k + 1, so that what it does costs no time of the
+    loop as long as it takes less than physics does.
+    """
 
     index: int
     """0: the reset; k: control step k."""
@@ -99,7 +103,8 @@ def fly(
         kinematic: whether contact is known from the clearance rather than from physics.
         on_contact: "end" or "continue", see `TubeTask`.
         step_limit: control steps until a time-out, None for the limit of each tube.
-        on_step: called after the reset and after each control step; returning True ends the flight.
+        on_step: called after the reset and for each control step; returning True ends the flight after the
+            step that is under way, which is the last that it sees.
 
     Raises:
         SettingsError: seeds or parameters do not fit.
@@ -114,8 +119,13 @@ def fly(
     phases, totals = np.zeros((2, len(PHASES)), dtype=np.int64)
     poses = session.reset(resets)
     state = task.begin(np.arange(geometry.lanes), poses)
-    step = FlightStep(0, commands.raw, poses.raw, actions, state, phases)
-    stopped = on_step is not None and on_step(step)
+    step = FlightStep(0, np.zeros_like(commands.raw), poses.raw, actions.copy(), state, phases)
+    stopped = False
+
+    def report() -> None:
+        nonlocal stopped
+        stopped = on_step is not None and bool(on_step(step))
+
     commands.compensation[:] = settings.drone.compensation
     clock = time.perf_counter_ns
     started = clock()
@@ -125,7 +135,7 @@ def fly(
         if over:
             commands.speed[state.outcome != int(Outcome.RUNNING)] = 0.0
         decided = clock()
-        poses = session.step(commands)
+        poses = session.step(commands, report)
         answered = clock()
         task.observe(poses)
         seen = clock()
@@ -135,7 +145,9 @@ def fly(
         totals += phases
         step.index += 1
         step.pose = poses.raw
-        stopped = on_step is not None and on_step(step)
+        step.command[:] = commands.raw
+        step.actions[:] = actions
+    report()
     return FlightResult(
         outcome=tuple(Outcome(value) for value in state.outcome.tolist()),
         steps=state.step.copy(),

@@ -164,11 +164,14 @@ class AgentSession:
         """How long the physics side's plant worked in the last exchange (s)."""
         return self._engine_ns * 1e-9
 
-    def step(self, commands: CommandBatch) -> PoseBatch:
+    def step(self, commands: CommandBatch, meanwhile: Callable[[], None] | None = None) -> PoseBatch:
         """Integrate one control step in every lane.
 
         Args:
             commands: (N, 8), all lanes reset before. Reusing one batch is fastest.
+            meanwhile: called when the physics side has the commands and works: the place for what need not be
+                finished before, such as recording the step before. The poses of that step still stand. An
+                exception in it ends the session.
 
         Returns:
             Poses of all lanes: the same batch every time, valid until the next call.
@@ -180,7 +183,7 @@ class AgentSession:
         if commands is not self._commands:
             self._command_bytes = layout.flat_bytes(commands.raw, COMMAND_WORDS, self.lanes, "commands")
             self._commands = commands
-        self._exchange(Event.STEP, self.steps + 1, self._wire_commands, self._command_bytes)
+        self._exchange(Event.STEP, self.steps + 1, self._wire_commands, self._command_bytes, meanwhile)
         return self._poses
 
     def reset(self, resets: ResetBatch) -> PoseBatch:
@@ -249,7 +252,14 @@ class AgentSession:
         except ProtocolError as error:
             _log.warning("no orderly goodbye: %s", error)
 
-    def _exchange(self, event: Event, due: int, wire: memoryview, payload: memoryview | bytes) -> None:
+    def _exchange(
+        self,
+        event: Event,
+        due: int,
+        wire: memoryview,
+        payload: memoryview | bytes,
+        meanwhile: Callable[[], None] | None = None,
+    ) -> None:
         """Publish a request with its payload and take in the reply, after which `due` steps are integrated."""
         try:
             asking = TRANSITIONS[self._state][event]
@@ -267,6 +277,8 @@ class AgentSession:
             if FENCE is not None:
                 FENCE()
             words[_DOORBELL] = number
+            if meanwhile is not None:
+                meanwhile()
             rung = self._wait(before, due, _PHASES[event])
             if FENCE is not None:
                 FENCE()

@@ -165,11 +165,18 @@ def test_on_step_sees_the_reset_and_every_control_step(cylinder: Maker) -> None:
 
 
 def test_on_step_may_end_the_flight(cylinder: Maker) -> None:
-    """After the reset, or after any step; the outcome is then still RUNNING."""
+    """After the reset, or after any step: the step under way is the last, and the outcome is still RUNNING."""
     tube = cylinder()
     for wanted in (0, 3):
-        result = flight(tube, PurePursuit(tube, Settings()), on_step=lambda s, w=wanted: s.index == w)
-        assert result.control_steps == wanted
+        seen: list[int] = []
+
+        def stop(step: FlightStep, seen: list[int] = seen, wanted: int = wanted) -> bool:
+            seen.append(step.index)
+            return step.index == wanted
+
+        result = flight(tube, PurePursuit(tube, Settings()), on_step=stop)
+        assert result.control_steps == wanted + 1
+        assert seen == list(range(wanted + 2))
         assert result.outcome == (Outcome.RUNNING,)
 
 

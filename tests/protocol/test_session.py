@@ -69,6 +69,35 @@ def test_a_step_is_exactly_its_inner_steps(
         assert session.steps == k
 
 
+def test_the_agent_may_work_while_physics_does(
+    open_session: Open, resets: Resets, commands: Commands
+) -> None:
+    """What is given as `meanwhile` runs once a step, sees the poses of the step before, and changes nothing."""
+    session = open_session()
+    poses = session.reset(resets())
+    seen: list[int] = []
+    for k in range(1, 4):
+        session.step(commands(), lambda: seen.append(int(poses.step[0])))
+        assert poses.step[0] == k
+    assert seen == [0, 1, 2]
+
+
+def test_an_error_in_the_agents_own_work_ends_the_session(
+    open_session: Open, resets: Resets, commands: Commands
+) -> None:
+    """It arrives as it was raised, and the session cannot be used any more."""
+    session = open_session()
+    session.reset(resets())
+
+    def fail() -> None:
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        session.step(commands(), fail)
+    with pytest.raises(SessionError):
+        session.step(commands())
+
+
 def test_nothing_moves_without_a_command(open_session: Open, resets: Resets) -> None:
     """A lane that is reset keeps its state over any number of other requests."""
     session = open_session()
