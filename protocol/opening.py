@@ -33,6 +33,7 @@ _NOT_YET: Final = bytes(8)
 _HEADER_BYTES: Final = 2048
 _DEAD_AGENT: Final = "stale segments of a dead agent"
 _UNFINISHED: Final = "a header that is not finished"
+_TOO_SHORT: Final = "a file too short for a segment"
 
 
 def create_segments(rendezvous: Rendezvous, lanes: int) -> Segments:
@@ -107,7 +108,7 @@ def attach_segments(rendezvous: Rendezvous, timeout: float) -> Segments:
     Raises:
         PeerLost: no session was offered within `timeout` seconds.
         SessionError: another physics process serves the session or has served it.
-        HandshakeError: a segment is too small to be one.
+        HandshakeError: the pose segment is too small to be one.
     """
     began = whole = time.monotonic()
     found = "nothing of that name"
@@ -123,6 +124,12 @@ def attach_segments(rendezvous: Rendezvous, timeout: float) -> Segments:
             how = f"no session at {rendezvous} within {timeout} s, found {found}; is the agent running?"
             raise PeerLost("agent", how, Verdict.TOO_SLOW, 0, "attach")
         time.sleep(LOOK_AGAIN_S)
+
+
+def remove_if_dead(segments: Segments) -> None:
+    """Remove the segments of an agent that is dead by now, for whatever reason its physics side leaves."""
+    if _not_on_offer(segments.command) == _DEAD_AGENT:
+        segments.unlink()
 
 
 def _try_attach(rendezvous: Rendezvous, patient: bool) -> tuple[Segments | None, str]:
@@ -158,7 +165,8 @@ def _try_attach(rendezvous: Rendezvous, patient: bool) -> tuple[Segments | None,
 
 def _not_on_offer(command: Segment) -> str:
     """Say why the session behind a command segment cannot be attached to; empty where it can."""
-    _check_header_fits(command)
+    if len(command.view) < _HEADER_BYTES:  # not ours; or one that grows, on a file system that cannot reserve
+        return _TOO_SHORT
     word = magic(command.view)
     if word == _NOT_YET:
         return _UNFINISHED

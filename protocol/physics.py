@@ -11,12 +11,12 @@ from typing import Final
 import numpy as np
 
 from protocol import handshake, layout, validation
-from protocol.errors import PeerLost, PeerViolation, Refusal, RefusalCode, Verdict
+from protocol.errors import PeerViolation, Refusal, RefusalCode
 from protocol.handshake import Answer
 from protocol.layout import COMMAND, POSE, Axes, Op, Status, read_i64
 from protocol.liveness import start_time
 from protocol.memory import FENCE, parse_rendezvous
-from protocol.opening import attach_segments
+from protocol.opening import attach_segments, remove_if_dead
 from protocol.plant import (
     COMMAND_WORDS,
     NO_TUBE,
@@ -46,7 +46,7 @@ def serve(rendezvous: str, plant: Plant, attach_timeout: float = 30.0) -> None:
     """Wait for the session that an agent offers at `rendezvous`, then answer its requests until it says goodbye.
 
     May be called before the agent has created the session. Closes the plant. Leaves a farewell for the agent
-    whenever it ends otherwise than by the agent's goodbye, and removes the segments of an agent that died.
+    whenever it ends otherwise than by the agent's goodbye, and removes the segments if the agent is dead by then.
 
     Raises:
         SessionError: the rendezvous cannot be used, or another physics process serves the session.
@@ -59,11 +59,8 @@ def serve(rendezvous: str, plant: Plant, attach_timeout: float = 30.0) -> None:
         segments = attach_segments(parse_rendezvous(rendezvous), attach_timeout)
         try:
             _serve_attached(segments.command.view, segments.pose.view, plant)
-        except PeerLost as error:
-            if error.verdict is Verdict.EXITED:
-                segments.unlink()
-            raise
         finally:
+            remove_if_dead(segments)
             segments.close()
     finally:
         plant.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from physics_server.law import control_law, gust_force, splitmix64
 from physics_server.parameters import SPEED_MAX, BodyParameters
+from protocol import plant
 from protocol.plant import PARAMETERS
 
 numbers = st.floats(-5, 5)
@@ -117,3 +119,11 @@ def test_the_defaults_are_the_table_of_the_protocol() -> None:
         assert parameter.lowest <= value <= parameter.highest, parameter.name
         assert not (parameter.above_lowest and value == parameter.lowest), parameter.name
         assert not parameter.either or value in parameter.either, parameter.name
+
+
+def test_the_specification_has_the_defaults() -> None:
+    """The defaults and the largest speed that the protocol's page gives for this server are its own."""
+    page = " ".join((Path(plant.__file__).parent / "README.md").read_text(encoding="utf-8").split())
+    values = zip(PARAMETERS, BodyParameters().row(), strict=True)
+    assert ", ".join(f"{parameter.name} {value:g}" for parameter, value in values) in page
+    assert f"`speed_max` {SPEED_MAX:g} " in page

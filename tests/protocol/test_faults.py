@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -16,8 +17,14 @@ import pytest
 
 from protocol import layout
 from protocol.agent import AgentSession, SessionSettings
-from protocol.errors import PeerLost, SessionError, Verdict
-from protocol.plant import CommandBatch, ResetBatch
+from protocol.errors import PeerLost, PeerViolation, SessionError, Verdict
+from protocol.handshake import Offer, write_farewell, write_offer
+from protocol.layout import Farewell, Op
+from protocol.liveness import start_time
+from protocol.memory import parse_rendezvous
+from protocol.opening import create_segments
+from protocol.physics import serve
+from protocol.plant import CommandBatch, PoseBatch, ResetBatch
 from protocol.toy import ToyPlant
 from protocol.twin import open_twin
 
@@ -88,6 +95,38 @@ def test_a_killed_agent_leaves_nothing(
     assert server.returncode == 3
     assert f"PeerLost: lost agent (pid {agent.pid})" in said
     assert "killed by SIGKILL" in said or "its process is gone" in said
+
+
+@pytest.mark.parametrize("last", ["error of the plant", "farewell", "early request"])
+def test_a_dead_agent_leaves_nothing_whatever_ended_the_server(rendezvous: str, last: str) -> None:
+    """The server leaves for another reason than the agent's death, and still removes both segments."""
+    agent = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    segments = create_segments(parse_rendezvous(rendezvous), 1)
+    command = segments.command.view
+    write_offer(command, Offer(SETTINGS, bytes(16), agent.pid, start_time(agent.pid)))
+
+    class LastAct(ToyPlant):
+        """The toy plant; while it is at work the agent does one last thing and dies."""
+
+        def reset(self, resets: ResetBatch, poses: PoseBatch) -> None:
+            if last == "farewell":
+                write_farewell(command, Farewell.STOPPED, "it was told to stop")
+            elif last == "early request":
+                layout.write_i64(command, layout.COMMAND["begin"], 2)
+            agent.kill()
+            agent.wait()
+            if last == "error of the plant":
+                raise ZeroDivisionError(last)
+
+    for field, value in (("begin", 1), ("op", Op.RESET), ("step", 0), ("end", 1), ("doorbell", 1)):
+        layout.write_i64(command, layout.COMMAND[field], value)
+    ends = {"farewell": PeerLost, "early request": PeerViolation}
+    with pytest.raises(ends.get(last, ZeroDivisionError)):
+        serve(rendezvous, LastAct())
+    left = [path for segment in (segments.command, segments.pose) if (path := segment.path) and path.exists()]
+    segments.unlink()
+    segments.close()
+    assert left == []
 
 
 def test_a_stopped_server_is_waited_for(

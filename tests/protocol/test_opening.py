@@ -212,6 +212,17 @@ def test_physics_gives_up_when_no_agent_comes(rendezvous: str) -> None:
         serve(rendezvous, ToyPlant(), attach_timeout=0.1)
 
 
+def test_physics_waits_for_a_segment_that_is_still_too_short(rendezvous: str) -> None:
+    """A file that has not the bytes of a header yet is no error and is not removed."""
+    segment = create_segment(parse_rendezvous(rendezvous), ".cmd", 100)
+    with pytest.raises(PeerLost, match=r"within 0.6 s, found a file too short for a segment"):
+        serve(rendezvous, ToyPlant(), attach_timeout=0.6)
+    assert segment.path is not None
+    assert segment.path.exists()
+    segment.unlink()
+    segment.close()
+
+
 def test_the_agent_gives_up_when_nobody_attaches(rendezvous: str) -> None:
     """Without a physics process in time the agent says so and leaves nothing."""
     with pytest.raises(PeerLost, match=r"nobody attached to .* within 0.1 s") as caught:
