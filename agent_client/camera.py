@@ -17,11 +17,10 @@ from agent_client.episodes import Records
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 
 @njit(cache=True, error_model="numpy")
-def look(lanes: Ints, episodes: Records, constants: Records, targets: Floats, clear: Bools) -> None:
+def look(lanes: Ints, episodes: Records, constants: Records, targets: Floats, free: Floats) -> None:
     """Where each drone's target is, and whether it is seen.
 
     Args:
@@ -29,7 +28,7 @@ def look(lanes: Ints, episodes: Records, constants: Records, targets: Floats, cl
         episodes: (N,) records; `position` and `frame` are read, the `target_...` fields are written.
         constants: (1,) record of the task's constants.
         targets: (N, 3) points of the axis, world frame (m).
-        clear: (N,) whether the line of sight meets no wall.
+        free: (N,) distance to the wall along the line of sight (m).
     """
     half_width, half_height = constants[0].half_width, constants[0].half_height
     for k in range(lanes.shape[0]):
@@ -53,7 +52,7 @@ def look(lanes: Ints, episodes: Records, constants: Records, targets: Floats, cl
             e.target_position[c] = targets[i, c]
         e.target_direction[0], e.target_direction[1], e.target_direction[2] = x, y, z
         e.target_distance = distance
-        e.target_visible = in_view and clear[i]
+        e.target_visible = in_view and free[i] >= distance
 
 
 @njit(cache=True)

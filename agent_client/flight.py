@@ -124,6 +124,7 @@ def fly(
 
     def report() -> None:
         nonlocal stopped
+        task.measure_clearance()
         stopped = on_step is not None and bool(on_step(step))
 
     commands.compensation[:] = settings.drone.compensation

@@ -37,7 +37,7 @@ def place(
     tangent: Floats,
     radial_distance: Floats,
     radius: Floats,
-    clearance: Floats,
+    free: Floats,
     near: Floats,
     fresh: bool,
 ) -> None:
@@ -51,15 +51,17 @@ def place(
         tangent: (N, 3).
         radial_distance: (N,).
         radius: (N,).
-        clearance: (N,) distance of the centre to the wall (m), negative outside of the tube.
+        free: (N,) distance to the wall from the nearest axis point towards the centre (m).
         near: (N,) output: where the next search of the axis begins.
         fresh: whether an episode begins here, so that nothing came before.
     """
     for k in range(lanes.shape[0]):
         i = lanes[k]
         e = episodes[i]
+        along = 0.0
         for c in range(3):
             e.axis_position[c], e.tangent[c] = position[i, c], tangent[i, c]
+            along += (e.position[c] - position[i, c]) * tangent[i, c]
         if fresh:
             e.speed_before, e.arc_before = e.speed, arc_length[i]
         else:
@@ -67,7 +69,18 @@ def place(
         e.arc_length, near[i] = arc_length[i], arc_length[i]
         e.radial_distance, e.radius = radial_distance[i], radius[i]
         e.progress = min(max(e.arc_length / e.length, 0.0), 1.0)
-        e.inside, e.clearance = clearance[i] > 0.0, clearance[i]
+        # No wall on the way from the axis, and neither before the start nor behind the end.
+        behind = along < 0.0 and e.arc_length <= 0.0
+        beyond = along > 0.0 and e.arc_length >= e.length
+        e.inside = free[i] >= e.radial_distance and not (behind or beyond)
+
+
+@njit(cache=True)
+def note_clearance(lanes: Ints, episodes: Records, clearance: Floats) -> None:
+    """Take over the distance to the wall (m), (N,), negative outside of the tube, and the smallest so far."""
+    for k in range(lanes.shape[0]):
+        e = episodes[lanes[k]]
+        e.clearance = clearance[lanes[k]]
         e.min_clearance = min(e.min_clearance, e.clearance)
 
 

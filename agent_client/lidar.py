@@ -8,6 +8,7 @@ spokes, run from the centre along +f and -f, and a ring whose spoke is blocked r
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -22,6 +23,10 @@ Ints = NDArray[np.int64]
 SPOKES: Final = 2
 """Rays before the rings in a batch: along +f, then along -f."""
 
+LINES: Final = 2
+"""Lines of sight behind the rings in a batch: from the centre to the camera's target, and from the nearest
+axis point to the centre. One batch asks the geometry less often than one question each."""
+
 
 def ring_circle(rays: int) -> Floats:
     """Directions of a ring's rays in its plane, (rays, 2): components along r and u."""
@@ -34,24 +39,40 @@ def ring_sectors(rays: int) -> Ints:
     return ((np.arange(rays) * 8 + rays) // (2 * rays) % 4).astype(np.int64)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
+def place_line(start: Floats, end: Floats, otherwise: Floats, origin: Floats, direction: Floats) -> None:
+    """A ray from `start` towards `end`, all (3,); along `otherwise` where they are the same place."""
+    square = 0.0
+    for c in range(3):
+        origin[c], direction[c] = start[c], end[c] - start[c]
+        square += direction[c] * direction[c]
+    length = math.sqrt(square)
+    for c in range(3):
+        direction[c] = direction[c] / length if length > 0.0 else otherwise[c]
+
+
+@njit(cache=True, error_model="numpy")
 def place_rays(
     lanes: Ints,
     episodes: Records,
     constants: Records,
     circle: Floats,
+    targets: Floats,
+    feet: Floats,
     origins: Floats,
     directions: Floats,
 ) -> None:
-    """Origins and directions of all rays: the two spokes, the front ring, the rear ring.
+    """Origins and directions of all rays: the two spokes, the front ring, the rear ring, the two lines of sight.
 
     Args:
         lanes: (K,) the lanes to compute.
         episodes: (N,) records; `position` and `frame` are read.
         constants: (1,) record of the task's constants.
         circle: (rays, 2) from `ring_circle`.
-        origins: (N, 2 + 2 rays, 3) output, world frame (m).
-        directions: (N, 2 + 2 rays, 3) output, unit vectors.
+        targets: (N, 3) points that the camera looks at (m).
+        feet: (N, 3) nearest points of the axis (m).
+        origins: (N, 4 + 2 rays, 3) output, world frame (m).
+        directions: (N, 4 + 2 rays, 3) output, unit vectors.
     """
     rays, offset = circle.shape[0], constants[0].lidar_offset
     for k in range(lanes.shape[0]):
@@ -66,6 +87,9 @@ def place_rays(
                 d = circle[j, 0] * r + circle[j, 1] * u
                 directions[i, 2 + j, c], directions[i, 2 + rays + j, c] = d, d
                 origins[i, 2 + j, c], origins[i, 2 + rays + j, c] = front, rear
+        sight = 2 + 2 * rays
+        place_line(position, targets[i], frame[0], origins[i, sight], directions[i, sight])
+        place_line(feet[i], position, frame[1], origins[i, sight + 1], directions[i, sight + 1])
 
 
 @njit(cache=True)
@@ -80,7 +104,7 @@ def read_rings(lanes: Ints, episodes: Records, constants: Records, distances: Fl
         lanes: (K,) the lanes to compute.
         episodes: (N,) records; `lidar` (m) and the fields LIDAR_SUMMARY are written.
         constants: (1,) record of the task's constants.
-        distances: (N, 2 + 2 rays) along the rays of `place_rays` (m).
+        distances: (N, 4 + 2 rays) along the rays of `place_rays` (m).
         sectors: (rays,) from `ring_sectors`.
     """
     rays = sectors.shape[0]

@@ -21,7 +21,6 @@ from agent_client.reward import choose_regimes, score
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 
 @njit(cache=True, error_model="numpy")
@@ -31,7 +30,8 @@ def aim(
     constants: Records,
     poses: Floats,
     circle: Floats,
-    position: Floats,
+    targets: Floats,
+    feet: Floats,
     origins: Floats,
     directions: Floats,
 ) -> None:
@@ -43,13 +43,13 @@ def aim(
         constants: (1,) record of the task's constants.
         poses: (N, 16) block of `protocol.plant.PoseBatch`.
         circle: (rays, 2) from `agent_client.lidar.ring_circle`.
-        position: (N, 3) output: the centres alone (m).
-        origins: (N, 2 + 2 rays, 3) output, see `agent_client.lidar.place_rays`.
-        directions: (N, 2 + 2 rays, 3) output.
+        targets: (N, 3) points of the axis to look at (m).
+        feet: (N, 3) nearest points of the axis (m).
+        origins: (N, 4 + 2 rays, 3) output, see `agent_client.lidar.place_rays`.
+        directions: (N, 4 + 2 rays, 3) output.
     """
     take_poses(lanes, episodes, poses)
-    place_rays(lanes, episodes, constants, circle, origins, directions)
-    position[:, :] = poses[:, :3]
+    place_rays(lanes, episodes, constants, circle, targets, feet, origins, directions)
 
 
 @njit(cache=True, error_model="numpy")
@@ -63,10 +63,8 @@ def assess(
     tangent: Floats,
     radial_distance: Floats,
     radius: Floats,
-    clearance: Floats,
     distances: Floats,
     targets: Floats,
-    clear: Bools,
     sectors: Ints,
     mask: Singles,
     fresh: bool,
@@ -85,21 +83,21 @@ def assess(
         tangent: (N, 3).
         radial_distance: (N,).
         radius: (N,).
-        clearance: (N,) distance of the centre to the wall (m), negative outside of the tube.
-        distances: (N, 2 + 2 rays) along the rays (m).
+        distances: (N, 4 + 2 rays) along the rays (m).
         targets: (N, 3) points of the axis to look at (m).
-        clear: (N,) whether no wall stands between.
         sectors: (rays,) from `agent_client.lidar.ring_sectors`.
         mask: (37,) from `agent_client.features.feature_mask`.
         fresh: whether episodes begin here: nothing is judged then.
         near: (N,) output: where the next search of the axis begins.
         observation: (N, 37) output.
     """
+    sight = distances.shape[1] - 2
     place(
-        lanes, episodes, arc_length, axis_position, tangent, radial_distance, radius, clearance, near, fresh
-    )
+        lanes, episodes, arc_length, axis_position, tangent, radial_distance, radius, distances[:, sight + 1],
+        near, fresh,
+    )  # fmt: skip
     read_rings(lanes, episodes, constants, distances, sectors)
-    look(lanes, episodes, constants, targets, clear)
+    look(lanes, episodes, constants, targets, distances[:, sight])
     remember(lanes, episodes, constants)
     choose_regimes(lanes, episodes)
     if not fresh:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from agent_client.episodes import OnContact, Records, constants, episode_dtype
 from agent_client.errors import SettingsError
 from agent_client.features import FEATURES, feature_mask
-from agent_client.judge import Outcome
-from agent_client.lidar import SPOKES, ring_circle, ring_sectors
+from agent_client.judge import Outcome, note_clearance
+from agent_client.lidar import LINES, SPOKES, ring_circle, ring_sectors
 from agent_client.perception import aim, assess
 from agent_client.reward import Regime
 from agent_client.settings import Settings, max_steps
@@ -70,7 +70,7 @@ class TaskStep:
     inside: Bools  # (N,)
     """Whether the centre is inside the tube."""
     clearance: Floats  # (N,)
-    """Distance of the centre to the wall (m), negative outside."""
+    """Distance of the centre to the wall (m), negative outside; see `TubeTask.measure_clearance`."""
     contact: Bools  # (N,)
     """Whether the body touched the wall in this step."""
     lidar: Floats  # (N, 2 rays)
@@ -97,7 +97,7 @@ class TaskStep:
     contacts: Ints  # (N,)
     """Control steps of the episode with contact."""
     min_clearance: Floats  # (N,)
-    """Smallest clearance of the episode so far, the start included (m)."""
+    """Smallest clearance of the episode so far, the start included (m); see `TubeTask.measure_clearance`."""
 
     @classmethod
     def over(cls, episodes: Records) -> TaskStep:
@@ -150,17 +150,23 @@ class TubeTask:
         self.ray_nanoseconds = 0
         """How long rays and lines of sight took in the last call."""
         self._step_limit = step_limit
-        self._target_distance, self._reach = settings.camera.target_distance, settings.lidar.reach
+        self._kinematic = kinematic
+        self._target_distance = settings.camera.target_distance
+        # One reach for all rays. The target lies no further away than its arc length and the offset from the
+        # axis together: twice the arc length reaches it in any tube of R up to that length.
+        self._reach = max(settings.lidar.reach, 2.0 * self._target_distance)
         self._constants = constants(settings, dt, kinematic=kinematic, on_contact=on_contact)
         self._mask = feature_mask(settings.masked_features)
         self._episodes: Records = np.zeros(n, dtype=episode_dtype(rays))
         self._episodes["max_steps"] = 1
         self._step = TaskStep.over(self._episodes)
         self._all: Ints = np.arange(n)
+        self._unmeasured = self._all[:0]
+        self._axis: AxisPoints
         self._position = np.zeros((n, 3))
         self._ahead = np.zeros(n)
         self._near: Floats = np.full(n, np.nan)
-        self._origins = np.zeros((n, SPOKES + 2 * rays, 3))
+        self._origins = np.zeros((n, SPOKES + 2 * rays + LINES, 3))
         self._directions = np.zeros_like(self._origins)
         self._circle, self._sectors = ring_circle(rays), ring_sectors(rays)
 
@@ -213,16 +219,31 @@ class TubeTask:
         """Bring the records and observations of `lanes` up to their poses; judge them unless they are fresh."""
         geometry, episodes, constant, raw = self.geometry, self._episodes, self._constants, poses.raw
         position, origins, directions = self._position, self._origins, self._directions
-        aim(lanes, episodes, constant, raw, self._circle, position, origins, directions)
-        axis = geometry.project(position, self._near)
+        np.copyto(position, poses.position)
+        axis = self._axis = geometry.project(position, self._near)
         np.add(axis.arc_length, self._target_distance, out=self._ahead)
         targets, _ = geometry.axis(self._ahead)
+        aim(lanes, episodes, constant, raw, self._circle, targets, axis.position, origins, directions)
         started = time.perf_counter_ns()
         distances = geometry.rays(origins, directions, self._reach, active)
-        clear = geometry.visible(position, targets)
         self.ray_nanoseconds = time.perf_counter_ns() - started
+        self._unmeasured = lanes
+        if self._kinematic:
+            self.measure_clearance()
         assess(
             lanes, episodes, constant, raw.view(np.int64), axis.arc_length, axis.position, axis.tangent,
-            axis.radial_distance, axis.radius, geometry.clearance(position, axis), distances, targets, clear,
+            axis.radial_distance, axis.radius, distances, targets,
             self._sectors, self._mask, fresh, self._near, self._step.observation,
         )  # fmt: skip
+
+    def measure_clearance(self) -> None:
+        """Measure `clearance` and `min_clearance` of the lanes that `begin` or `observe` looked at last.
+
+        Where physics reports contact no decision depends on them, and they take as long as the rest of
+        perception: `begin` and `observe` then leave them as they were, and whoever wants them calls this after
+        each, best while physics works. In the kinematic world they are always up to date.
+        """
+        if len(self._unmeasured):
+            clearance = self.geometry.clearance(self._position, self._axis)
+            note_clearance(self._unmeasured, self._episodes, clearance)
+            self._unmeasured = self._all[:0]

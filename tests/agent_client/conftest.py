@@ -15,8 +15,8 @@ from protocol.plant import PoseBatch
 class CylinderGeometry(Geometry):
     """Straight open tubes along world x from the origin, lane i of radius `radius[i]`; closed forms in numpy.
 
-    `wall_at` puts an opaque sheet across the tube at that x, which blocks sight but no LiDAR ray: it stands
-    for whatever may come between a camera and its target.
+    `wall_at` puts an opaque sheet across the tube at that x: it stands for whatever may come between a camera
+    and its target.
     """
 
     def __init__(self, lanes: int = 1, radius: float = 1.0, length: float = 20.0) -> None:
@@ -39,6 +39,10 @@ class CylinderGeometry(Geometry):
         x = origins[..., 0] + t * directions[..., 0]
         hit = (a > 1e-18) & (x >= 0.0) & (x <= self._length[:, None])
         distance = np.where(c > 0.0, 0.0, np.where(hit, np.minimum(t, reach), reach))
+        if np.isfinite(self.wall_at):
+            with np.errstate(divide="ignore"):
+                sheet = (self.wall_at - origins[..., 0]) / directions[..., 0]
+            distance = np.where((sheet > 0.0) & (sheet < distance), sheet, distance)
         return distance if active is None else np.where(active[:, None], distance, np.nan)
 
     def project(self, points: Floats, near: Floats | None = None) -> AxisPoints:
