@@ -13,6 +13,7 @@ import io
 import os
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +35,9 @@ SB3_FILES: Final = ("data", "policy.pth")
 # Entries carry this date, and the machine is left out, so that the same policy is the same file.
 _DATE: Final = (2000, 1, 1, 0, 0, 0)
 _SYSTEM_INFO: Final = "system_info.txt"
+
+_DAMAGE: Final = (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, UnicodeDecodeError)
+"""What `zipfile` raises for archives that cannot be read; RuntimeError stands for encrypted entries."""
 
 
 @dataclass(frozen=True)
@@ -57,22 +61,22 @@ def read_checkpoint(path: Path) -> Checkpoint:
     """Read contract and actor of a checkpoint, without torch and without pickle.
 
     Raises:
-        PolicyError: no such file, an empty file, no .zip, a .zip that is no checkpoint, or a damaged one.
+        PolicyError: no such file, one that may not be read, an empty file, no .zip, a .zip that is no
+            checkpoint, or a damaged one.
     """
-    if not path.is_file():
-        raise PolicyError(f"{path}: expected a checkpoint (.zip), found no such file")
-    if path.stat().st_size == 0:
+    content = _read_bytes(path)
+    if not content:
         raise PolicyError(f"{path}: expected a checkpoint (.zip), found an empty file")
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
             names = set(archive.namelist())
             ours = {CONTRACT_FILE, ACTOR_FILE}
             if ours <= names:
                 contract = from_json(archive.read(CONTRACT_FILE).decode("utf-8"), str(path))
                 return Checkpoint(path, contract, _read_layers(archive.read(ACTOR_FILE), path))
-    except (zipfile.BadZipFile, UnicodeDecodeError, EOFError, OSError) as error:
+    except _DAMAGE as error:
         raise PolicyError(
-            f"{path}: expected a checkpoint (.zip), found a file that is none ({error})"
+            f"{path}: expected a checkpoint (.zip), found a file that is none or is damaged ({error})"
         ) from error
     if names & ours:
         raise PolicyError(
@@ -85,6 +89,18 @@ def read_checkpoint(path: Path) -> Checkpoint:
             f"policy with {' and '.join(SB3_FILES)}; found a foreign .zip ({found})"
         )
     return Checkpoint(path, None, None)
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        found = "no such file"
+    except IsADirectoryError:
+        found = "a folder"
+    except OSError as error:
+        found = f"what cannot be read: {error.strerror}"
+    raise PolicyError(f"{path}: expected a checkpoint (.zip), found {found}")
 
 
 def write_checkpoint(path: Path, sb3_zip: bytes, contract: Contract, layers: Sequence[Layer]) -> None:
@@ -134,7 +150,7 @@ def _read_layers(content: bytes, path: Path) -> tuple[Layer, ...]:
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             count = len(arrays.files) // 2
             pairs = [(arrays[f"weight_{i}"], arrays[f"bias_{i}"]) for i in range(count)]
-    except (KeyError, ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+    except (KeyError, ValueError, *_DAMAGE) as error:
         raise PolicyError(f"{path}: {ACTOR_FILE} is damaged ({error}); write the checkpoint again") from error
     inputs = None
     for i, (weight, bias) in enumerate(pairs):

@@ -28,6 +28,10 @@ LONGEST_STEP = 0.1
 """Longest step of a resampled centreline (m)."""
 LEAST_STEPS = 200
 """Steps that a short tube has at least."""
+LENGTHS = (1e-3, 1e5)
+"""Shortest and longest centreline (m): what lies outside is a wrong unit, not a tube."""
+FARTHEST = 1e9
+"""Largest coordinate (m): room for any survey's origin, and far from where single precision overflows."""
 RING = 36
 """Rays over which the local radius is the mean."""
 LEAST_HITS = RING // 2 + 1
@@ -105,7 +109,7 @@ def read_wall(path: str | Path, axes: Axes = "zup", scale: float = 1.0) -> Wall:
         scale: metres in one unit of the file.
 
     Raises:
-        MeshReadError: no such file, not a readable mesh, or one without faces.
+        MeshReadError: no such file, not a readable mesh, one without faces, or a scale that no tube has.
     """
     path = Path(path)
     content = read_bytes(path)
@@ -118,7 +122,7 @@ def read_wall(path: str | Path, axes: Axes = "zup", scale: float = 1.0) -> Wall:
         raise MeshReadError(f"{path}: expected a mesh with faces, found {len(vertices)} vertices and no face")
     used, faces = np.unique(corners, return_inverse=True)
     return Wall(
-        vertices=_to_world(vertices[used], axes, scale),
+        vertices=_to_world(vertices[used], axes, scale, path),
         faces=faces.reshape(-1, 3).astype(np.int32),
         path=path,
         sha256=hashlib.sha256(content).hexdigest(),
@@ -147,16 +151,17 @@ def read_tube(
 
     Raises:
         MeshReadError: either file cannot be read.
-        CentrelineError: the centreline is missing, is no single open path, or leaves the tube.
+        CentrelineError: the centreline is missing, is no single open path, has a length out of `LENGTHS`, or
+            leaves the tube.
     """
     wall = read_wall(mesh, axes, scale)
     path = _find_centreline(wall.path, centreline)
     content = read_bytes(path)
-    points = _to_world(parse_centreline(content, path), axes, scale)
+    points = _to_world(parse_centreline(content, path), axes, scale, path)
     if start_end == "last":
         points = points[::-1]
 
-    length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    length = _length(points, scale, path)
     axis, tangent = resample(points, min(LONGEST_STEP, length / LEAST_STEPS))
     tube = Tube(
         wall=wall,
@@ -175,11 +180,11 @@ def read_tube(
 def _find_centreline(mesh: Path, named: str | Path | None) -> Path:
     if named is not None:
         path = Path(named)
-        if not path.is_file():
+        if _is_missing(path):
             raise CentrelineError(f"{path}: expected the centreline of {mesh} here, found no such file")
         return path
     path = mesh.with_name(f"{mesh.stem}_centerline.obj")
-    if not path.is_file():
+    if _is_missing(path):
         raise CentrelineError(
             f"{mesh}: expected its centreline beside it as {path.name}, found no such file; it cannot be "
             f"found from the mesh yet: export the guide curve as an .obj of edges, under that name or "
@@ -188,15 +193,47 @@ def _find_centreline(mesh: Path, named: str | Path | None) -> Path:
     return path
 
 
-def _to_world(points: Floats, axes: Axes, scale: float) -> Floats:
+def _is_missing(path: Path) -> bool:
+    """Whether nothing is there; what is there and cannot be read is left to `read_bytes` to explain."""
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def _to_world(points: Floats, axes: Axes, scale: float, path: Path) -> Floats:
     if not (np.isfinite(scale) and scale > 0):
         raise MeshReadError(f"scale: expected a positive number of metres a unit, found {scale}")
+    if axes not in ("zup", "yup"):
+        raise MeshReadError(f"axes: expected 'zup' or 'yup', found {axes!r}")
+    with np.errstate(over="ignore", under="ignore"):
+        points = points * scale
+    farthest = np.abs(points).max(initial=0.0)
+    if not farthest <= FARTHEST:
+        raise MeshReadError(
+            f"{path}: scale: expected one that keeps all coordinates within {FARTHEST:g} m, found {scale:g} "
+            f"metres a unit, which puts one at {farthest:g} m; check the unit of the file"
+        )
     if axes == "zup":
-        return points * scale
-    if axes == "yup":
-        x, y, z = points.T
-        return np.stack([x, -z, y], axis=1) * scale
-    raise MeshReadError(f"axes: expected 'zup' or 'yup', found {axes!r}")
+        return points
+    x, y, z = points.T
+    return np.stack([x, -z, y], axis=1)
+
+
+def _length(points: Floats, scale: float, path: Path) -> float:
+    """Length (m) of a polyline (P, 3) that is plausible for a tube; CentrelineError for any other."""
+    with np.errstate(under="ignore"):
+        length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    shortest, longest = LENGTHS
+    if not shortest <= length <= longest:
+        raise CentrelineError(
+            f"{path}: scale: expected one that makes the centreline {shortest:g} m to {longest:g} m long, found "
+            f"{scale:g} metres a unit, which makes it {length:.4g} m; check the unit of the file"
+        )
+    return length
 
 
 def _parse_by_trimesh(content: bytes, path: Path) -> tuple[Floats, NDArray[np.int64], int]:

@@ -168,6 +168,35 @@ def test_a_missing_checkpoint_is_refused(tmp_path: Path) -> None:
     """A path without a file is refused by its name."""
     with pytest.raises(PolicyError, match=r"nothing\.zip: expected a checkpoint .* found no such file"):
         load_policy(tmp_path / "nothing.zip")
+    with pytest.raises(PolicyError, match=r"expected a checkpoint .* found a folder"):
+        load_policy(tmp_path)
+
+
+def test_a_checkpoint_that_may_not_be_read_is_refused(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The reason is given in words, without the system's number for it."""
+
+    def locked(self: Path) -> bytes:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "read_bytes", locked)
+    with pytest.raises(PolicyError, match=r"found what cannot be read: Permission denied$"):
+        load_policy(checkpoint)
+
+
+def test_an_encrypted_checkpoint_is_refused(tmp_path: Path, checkpoint: Path) -> None:
+    """Entries under a password are refused as what cannot be read."""
+    content = bytearray(checkpoint.read_bytes())
+    for mark, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        at = content.find(mark)
+        while at >= 0:
+            content[at + flags] |= 1
+            at = content.find(mark, at + 4)
+    path = tmp_path / "secret.zip"
+    path.write_bytes(content)
+    with pytest.raises(PolicyError, match=r"secret\.zip: expected a checkpoint .*encrypted"):
+        load_policy(path)
 
 
 @pytest.mark.parametrize(

@@ -355,6 +355,36 @@ def test_missing_centrelines_are_refused(write_tube: WriteTube, shapes: Any, tmp
         read_tube(path)
 
 
+@pytest.mark.parametrize("scale", [1e-300, 1e-5, 1e5, 1e12, 1e300])
+def test_absurd_scales_are_refused(scale: float, write_tube: WriteTube, shapes: Any) -> None:
+    """A 10 m tube that becomes a grain of dust, or longer than any, is refused before it is resampled."""
+    with pytest.raises((MeshReadError, CentrelineError), match=r"tube.*\.obj: scale: expected .* found 1[0e]"):
+        read_tube(write_tube(shapes.straight()), scale=scale)
+
+
+def test_files_behind_a_locked_folder_are_refused(
+    write_tube: WriteTube, shapes: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where looking at the centreline is forbidden already, the reason is given, and not that it is missing."""
+    path = write_tube(shapes.straight())
+    wall = read_wall(path)
+
+    def locked(self: Path, *_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr("meshes.tube.read_wall", lambda *_: wall)
+    monkeypatch.setattr(Path, "stat", locked)
+    monkeypatch.setattr(Path, "read_bytes", locked)
+    with pytest.raises(MeshReadError, match=r"tube_centerline\.obj: cannot be read: Permission denied$"):
+        read_tube(path)
+
+
+def test_a_folder_is_no_centreline(write_tube: WriteTube, shapes: Any, tmp_path: Path) -> None:
+    """A folder given as centreline is called one."""
+    with pytest.raises(MeshReadError, match="expected a file, found a folder"):
+        read_tube(write_tube(shapes.straight()), tmp_path)
+
+
 def test_centreline_that_changes_sides_of_a_wall_is_refused(
     write_tube: WriteTube, shapes: Any, tmp_path: Path
 ) -> None:
