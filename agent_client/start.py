@@ -68,7 +68,8 @@ def build_resets(
         parameters: plant parameters by name that differ from the defaults.
 
     Raises:
-        SettingsError: there are not as many seeds as lanes, or a parameter's name does not exist.
+        SettingsError: there are not as many seeds as lanes, a parameter's name does not exist, or a tube is too
+            short or too narrow to start in.
     """
     if len(seeds) != geometry.lanes:
         raise SettingsError(f"seeds: expected one for each of {geometry.lanes} lanes, found {len(seeds)}")
@@ -78,6 +79,7 @@ def build_resets(
         raise SettingsError(
             f"plant parameters: expected names out of {list(PARAMETER_INDEX)}, found {unknown}"
         )
+    _check_room(geometry, settings, chosen["body_radius"])
     resets = ResetBatch.zeros(geometry.lanes)
     for lane, seed in enumerate(seeds):
         draw_starts(resets, np.array([lane]), geometry, settings.start, np.random.default_rng(seed))
@@ -88,6 +90,31 @@ def build_resets(
     for name, value in chosen.items():
         resets.parameters[:, PARAMETER_INDEX[name]] = value
     return resets
+
+
+def _check_room(geometry: Geometry, settings: Settings, body_radius: float) -> None:
+    """Refuse tubes whose start is already their end, and those that the body does not fit into there.
+
+    Raises:
+        SettingsError: names the first lane whose tube is so.
+    """
+    start = np.full(geometry.lanes, settings.start.arc_length)
+    radius = geometry.project(geometry.axis(start)[0], start).radius.copy()
+    length = geometry.length
+    end_radius = geometry.project(geometry.axis(length)[0], length).radius
+    least = start + settings.task.success_radius * end_radius
+    for lane in range(geometry.lanes):
+        if not length[lane] > least[lane]:
+            raise SettingsError(
+                f"tube of lane {lane}: expected a length above {least[lane]:.4g} m (start.arc_length + "
+                f"task.success_radius x R at the end), found {length[lane]:.4g} m, which would be flown before "
+                f"the first step; check the scale"
+            )
+        if not radius[lane] > body_radius:
+            raise SettingsError(
+                f"tube of lane {lane}: R {radius[lane]:.4g} m at the start is not above the body's radius "
+                f"{body_radius:.4g} m; check the scale"
+            )
 
 
 def _circle(axes: Floats, turns: Floats) -> Floats:

@@ -82,6 +82,24 @@ def test_a_start_in_a_vertical_tube_looks_up(bend: Maker) -> None:
     assert forward[2] > math.cos(math.radians(8.1))
 
 
+def test_a_tube_that_is_flown_before_it_begins_is_refused(cylinder: Maker) -> None:
+    """At R 1 m the start at 0.6 m and the success radius of 0.5 R leave no way to fly in 1.1 m."""
+    tubes = cylinder(lanes=2)
+    tubes._length[1] = 1.09
+    with pytest.raises(SettingsError, match=r"lane 1: expected a length above 1\.1 m .* found 1\.09 m"):
+        build_resets(DESCRIPTION, tubes, Settings(), [0, 1])
+    tubes._length[1] = 1.11
+    build_resets(DESCRIPTION, tubes, Settings(), [0, 1])
+
+
+def test_a_tube_that_the_body_does_not_fit_into_is_refused(cylinder: Maker) -> None:
+    """The local radius at the start must be above the radius of the body that flies."""
+    with pytest.raises(SettingsError, match=r"R 0\.01 m at the start is not above the body's radius 0\.15 m"):
+        build_resets(DESCRIPTION, cylinder(radius=0.01), Settings(), [0])
+    with pytest.raises(SettingsError, match=r"not above the body's radius 1\.2 m"):
+        build_resets(DESCRIPTION, cylinder(), Settings(), [0], parameters={"body_radius": 1.2})
+
+
 def test_wrong_names_and_counts_are_refused(cylinder: Maker) -> None:
     """A misspelt parameter does not fly with its default."""
     with pytest.raises(SettingsError, match=r"plant parameters: expected .* found \['mas'\]"):
