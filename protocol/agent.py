@@ -35,6 +35,7 @@ from protocol.plant import (
     ResetBatch,
     TubeReference,
 )
+from protocol.signals import held_signals
 from protocol.states import TRANSITIONS, Event, State, follow
 from protocol.waiting import LOOK_S, Peer, Waiter, Watch
 
@@ -130,23 +131,38 @@ class AgentSession:
             HandshakeError: the two sides do not agree.
             PeerLost: no physics process attached in time, or it ended.
         """
+        session: AgentSession | None = None
+        try:
+            with (
+                held_signals()
+            ):  # an interrupt comes before the segments are there, or when they will be removed
+                session = cls._offering(rendezvous, settings)
+            _await_header(session._pose, rendezvous, watch, attach_timeout)
+            answer = handshake.read_answer(session._pose, session._offer)
+            peer = Peer("physics", answer.pid, answer.started, session._pose, watch)
+            session.attached(Waiter(session._reply, _REPLY_DOORBELL, peer, reply_timeout))
+        except BaseException as error:
+            with held_signals():
+                if session is not None:
+                    session._break(error)
+                    session.close()
+            raise
+        return session
+
+    @classmethod
+    def _offering(cls, rendezvous: str, settings: SessionSettings) -> AgentSession:
+        """Create the segments and write the agent's header."""
         segments = create_segments(parse_rendezvous(rendezvous), settings.lanes)
 
         def remove() -> None:
             segments.unlink()
             segments.close()
 
-        session = cls(segments.command.view, segments.pose.view, settings, remove)
         try:
-            _await_header(session._pose, rendezvous, watch, attach_timeout)
-            answer = handshake.read_answer(session._pose, session._offer)
-            peer = Peer("physics", answer.pid, answer.started, session._pose, watch)
-            session.attached(Waiter(session._reply, _REPLY_DOORBELL, peer, reply_timeout))
-        except BaseException as error:
-            session._break(error)
-            session.close()
+            return cls(segments.command.view, segments.pose.view, settings, remove)
+        except BaseException:
+            segments.unlink()
             raise
-        return session
 
     def attached(self, wait: Wait) -> None:
         """Take note of the physics side, whose header stands; `wait` waits for its replies.
@@ -225,18 +241,22 @@ class AgentSession:
         )
 
     def close(self) -> None:
-        """Say goodbye and remove the segments; a peer that is lost by now is logged. Idempotent."""
-        try:
-            if self._state is _READY:
-                self._say_goodbye()
-            elif Event.FAREWELL in TRANSITIONS[self._state]:
-                handshake.write_farewell(self._command, Farewell.STOPPED, "it closed the session")
-                self._state = follow(self._state, Event.FAREWELL)
-        finally:
-            self._views.close()
-            on_close, self._on_close = self._on_close, None
-            if on_close is not None:
-                on_close()
+        """Say goodbye and remove the segments; a peer that is lost by now is logged. Idempotent.
+
+        SIGINT and SIGTERM wait until it is done, at most `GOODBYE_S` and the engine's own end.
+        """
+        with held_signals():
+            try:
+                if self._state is _READY:
+                    self._say_goodbye()
+                elif Event.FAREWELL in TRANSITIONS[self._state]:
+                    handshake.write_farewell(self._command, Farewell.STOPPED, "it closed the session")
+                    self._state = follow(self._state, Event.FAREWELL)
+            finally:
+                self._views.close()
+                on_close, self._on_close = self._on_close, None
+                if on_close is not None:
+                    on_close()
 
     def __enter__(self) -> AgentSession:
         return self
