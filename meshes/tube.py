@@ -21,6 +21,9 @@ from meshes.obj import first_of_each, parse_obj, read_bytes, weld
 Axes = Literal["zup", "yup"]
 """Which way a file points: "zup" as the world; "yup" as Blender's export writes by default, (x, z, -y)."""
 
+FORMATS = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+"""Suffixes of the mesh formats that are read: those that trimesh reads without further packages, and .obj."""
+
 INDUSTRIAL = Path(__file__).parent / "industrial" / "industrial.obj"
 """The shipped conduit."""
 
@@ -101,7 +104,7 @@ class Tube:
 
 
 def read_wall(path: str | Path, axes: Axes = "zup", scale: float = 1.0) -> Wall:
-    """Read a mesh as the wall of a tube: .obj by this package, every other format by trimesh.
+    """Read a mesh as the wall of a tube: .obj by this package, the other `FORMATS` by trimesh.
 
     Args:
         path: the file.
@@ -237,20 +240,24 @@ def _length(points: Floats, scale: float, path: Path) -> float:
 
 
 def _parse_by_trimesh(content: bytes, path: Path) -> tuple[Floats, NDArray[np.int64], int]:
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
+        raise MeshReadError(
+            f"{path}: expected a mesh format that can be read ({', '.join(FORMATS)}), found {path.suffix!r}"
+        )
     import trimesh  # here, since it takes half a second that an .obj does not need
 
-    kind = path.suffix.lower().lstrip(".")
-    if kind not in trimesh.available_formats():
-        known = ", ".join(sorted({"obj", *trimesh.available_formats()}))
-        raise MeshReadError(
-            f"{path}: expected a mesh format that can be read ({known}), found {path.suffix!r}"
-        )
     try:
-        mesh = trimesh.load_scene(io.BytesIO(content), file_type=kind).to_mesh()
+        mesh = trimesh.load_scene(io.BytesIO(content), file_type=suffix[1:]).to_mesh()
         vertices = np.array(mesh.vertices, dtype=np.float64).reshape(-1, 3)
         faces = np.array(mesh.faces, dtype=np.int64).reshape(-1, 3)
+    except ImportError as error:  # asked for by rare contents only, damaged ones among them
+        raise MeshReadError(
+            f"{path}: not a readable mesh of format {suffix}; if the file is whole, reading it needs the package "
+            f"{error.name}, which is not installed"
+        ) from error
     except Exception as error:  # every loader of trimesh fails in its own way
-        raise MeshReadError(f"{path}: not a readable mesh ({type(error).__name__}: {error})") from error
+        raise MeshReadError(f"{path}: not a readable mesh of format {suffix} ({error})") from error
     if not np.isfinite(vertices).all():
         raise MeshReadError(f"{path}: expected finite coordinates, found NaN or infinity")
     kept = first_of_each(weld(vertices)[faces]) if len(faces) else np.empty(0, np.int64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -87,7 +88,11 @@ def test_other_formats_read_as_the_same_wall(suffix: str, tmp_path: Path, shapes
         ("noise.ply", b"no mesh at all", "not a readable mesh"),
         ("noise.stl", b"no mesh at all", "noise.stl: "),
         ("noise.glb", b"no mesh at all", "not a readable mesh"),
-        ("notes.txt", b"no mesh at all", "expected a mesh format that can be read .*found '.txt'"),
+        (
+            "notes.txt",
+            b"no mesh at all",
+            r"that can be read \(\.glb, \.gltf, \.obj, \.off, \.ply, \.stl\), found '\.txt'",
+        ),
     ],
 )
 def test_what_is_no_mesh_is_refused(name: str, content: bytes, message: str, tmp_path: Path) -> None:
@@ -95,6 +100,20 @@ def test_what_is_no_mesh_is_refused(name: str, content: bytes, message: str, tmp
     path = tmp_path / name
     path.write_bytes(content)
     with pytest.raises(MeshReadError, match=message):
+        read_wall(path)
+
+
+def test_a_package_that_a_damaged_file_asks_for_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A damaged .stl makes the loader guess an encoding; without the package for that, the message says so."""
+    path = tmp_path / "noise.stl"
+    path.write_bytes(bytes(range(128, 256)) * 3)
+    monkeypatch.setitem(sys.modules, "charset_normalizer", None)
+    with pytest.raises(
+        MeshReadError,
+        match=r"not a readable mesh of format \.stl; if .* needs the package charset_normalizer",
+    ):
         read_wall(path)
 
 
@@ -358,7 +377,9 @@ def test_missing_centrelines_are_refused(write_tube: WriteTube, shapes: Any, tmp
 @pytest.mark.parametrize("scale", [1e-300, 1e-5, 1e5, 1e12, 1e300])
 def test_absurd_scales_are_refused(scale: float, write_tube: WriteTube, shapes: Any) -> None:
     """A 10 m tube that becomes a grain of dust, or longer than any, is refused before it is resampled."""
-    with pytest.raises((MeshReadError, CentrelineError), match=r"tube.*\.obj: scale: expected .* found 1[0e]"):
+    with pytest.raises(
+        (MeshReadError, CentrelineError), match=r"tube.*\.obj: scale: expected .* found 1[0e]"
+    ):
         read_tube(write_tube(shapes.straight()), scale=scale)
 
 
