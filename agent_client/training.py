@@ -12,7 +12,7 @@ import platform
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,6 +21,7 @@ import stable_baselines3
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agent_client.checkpoint import write_checkpoint
@@ -51,6 +52,7 @@ class Hyperparameters:
     rollout: int = 200
     """Steps of each environment in a batch: the paper's fragment length."""
     minibatch: int = 1300
+    """At most; training takes the largest size not above it that divides a batch (`fitting_minibatch`)."""
     epochs: int = 10
     """Passes over a batch. Our choice."""
     gae_lambda: float = 0.95
@@ -150,6 +152,8 @@ def train(
     torch.set_num_threads(options.threads)
     torch.use_deterministic_algorithms(True)
     hyper = options.hyperparameters
+    hyper = replace(hyper, minibatch=fitting_minibatch(hyper))
+    options = replace(options, hyperparameters=hyper)  # so that the contract records what was trained with
     session_settings = SessionSettings(lanes=hyper.lanes, dt=options.dt, physics_dt=options.dt)
     opener = open_session or (lambda s: open_twin(KinematicPlant(options.settings), s))
     pools = [draw_pool(level, options.seed, options.pool, options.tubes) for level in range(LEVELS)]
@@ -170,11 +174,22 @@ def train(
     return options.out
 
 
+def fitting_minibatch(hyper: Hyperparameters) -> int:
+    """Size of the minibatches that training uses: the largest divisor of a batch not above `hyper.minibatch`.
+
+    A batch is lanes x rollout samples. A last minibatch of fewer samples would weigh these more than the others.
+    Where only single samples divide it, whose advantages cannot be normalised, it is the whole batch.
+    """
+    batch = hyper.lanes * hyper.rollout
+    sizes = range(2, min(hyper.minibatch, batch) + 1)
+    return max((size for size in sizes if batch % size == 0), default=batch)
+
+
 def _make_model(env: VecNormalize, options: TrainingOptions) -> PPO:
     hyper = options.hyperparameters
     first, last = hyper.learning_rate, hyper.final_learning_rate
     layers = list(hyper.hidden)
-    return PPO(
+    model = PPO(
         "MlpPolicy",
         env,
         learning_rate=first if first == last else _LinearRate(first, last),
@@ -193,6 +208,10 @@ def _make_model(env: VecNormalize, options: TrainingOptions) -> PPO:
         seed=options.seed,
         device="cpu",
     )
+    if options.tensorboard is None:
+        # The default logger, though it would write nothing, leaves a folder in the temporary directory.
+        model.set_logger(Logger(folder=None, output_formats=[]))
+    return model
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -136,6 +137,16 @@ def poses_at(
     poses.quaternion[:] = (Rotation.from_matrix(matrices) * Rotation.from_euler("x", roll)).as_quat()
     poses.linear_velocity[:] = speed * f
     return poses
+
+
+@pytest.fixture(autouse=True)
+def logs_of_stable_baselines3(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> Path:
+    """Keeps folders that stable-baselines3's loggers make out of the temporary directory that all share."""
+    folder: Path = tmp_path_factory.getbasetemp() / "stable_baselines3"
+    monkeypatch.setenv("SB3_LOGDIR", str(folder))
+    return folder
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tempfile
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from agent_client.contract import Normalisation, require_match, running_contract
 from agent_client.errors import PolicyError
 from agent_client.policy import load_policy
 from agent_client.settings import Settings
-from agent_client.training import Hyperparameters, Progress, TrainingOptions, train
+from agent_client.training import Hyperparameters, Progress, TrainingOptions, fitting_minibatch, train
 from agent_client.tubes import TubeRecipe
 
 SMALL = Hyperparameters(lanes=4, rollout=16, minibatch=32, epochs=2, hidden=(16, 8))
@@ -92,6 +93,35 @@ def test_a_training_writes_a_checkpoint_with_its_contract(tmp_path: Path) -> Non
     seen_by_network[:, [name == "progress" for name in policy.contract.observations]] = 0.0
     expected = torch_logits(model, seen_by_network.astype(np.float32))
     np.testing.assert_allclose(normalised(policy.logits(x)), expected, atol=1e-5)
+
+
+def test_a_training_leaves_nothing_in_the_temporary_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without TensorBoard no folder of logs is made anywhere."""
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    monkeypatch.delenv("SB3_LOGDIR")
+    train(options(tmp_path / "a.zip", steps=64))
+    assert list(temporary.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("lanes", "rollout", "minibatch", "expected"),
+    [(65, 200, 1300, 1300), (64, 200, 1300, 1280), (1, 200, 1300, 200), (7, 1, 4, 7), (4, 16, 0, 64)],
+)
+def test_minibatches_divide_a_batch(lanes: int, rollout: int, minibatch: int, expected: int) -> None:
+    """The largest divisor not above the size asked for; the whole batch where there is none but 1."""
+    asked = Hyperparameters(lanes=lanes, rollout=rollout, minibatch=minibatch)
+    assert fitting_minibatch(asked) == expected
+
+
+def test_a_training_records_the_minibatch_that_it_used(tmp_path: Path) -> None:
+    """A size that does not divide the batch trains without a warning, and the contract has the one used."""
+    odd = replace(SMALL, minibatch=31)
+    path = train(options(tmp_path / "a.zip", steps=64, hyperparameters=odd))
+    assert load_policy(path).contract.training["hyperparameters"]["minibatch"] == 16
 
 
 def test_the_same_seed_trains_the_same_policy(tmp_path: Path) -> None:
