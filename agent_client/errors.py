@@ -35,10 +35,20 @@ class Difference:
     """What runs now."""
 
 
+LISTED = 5
+"""Differences that a message lists; another action table alone can make a hundred."""
+
+
 class ContractMismatch(PolicyError):  # noqa: N818 - it is named after what it finds
-    """A checkpoint whose contract differs from what runs; `differences` lists every disagreement."""
+    """A checkpoint whose contract differs from what runs; `differences` has every disagreement, the message the
+    first `LISTED`."""
 
     def __init__(self, differences: Sequence[Difference], name: str) -> None:
         self.differences = tuple(differences)
-        listed = "; ".join(f"{d.name}: expected {d.expected}, found {d.found}" for d in self.differences)
+        listed = "; ".join(
+            f"{d.name}: expected {d.expected}, found {d.found}" for d in self.differences[:LISTED]
+        )
+        more = len(self.differences) - LISTED
+        if more > 0:
+            listed += f"; and {more} more"
         super().__init__(f"the contract of {name} does not fit what runs: {listed}")

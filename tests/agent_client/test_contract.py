@@ -87,6 +87,16 @@ def test_every_difference_is_listed() -> None:
     assert [d.name for d in caught.value.differences] == ["dt", "lidar.rays", "lidar.reach"]
 
 
+def test_a_message_lists_five_differences_and_counts_the_others() -> None:
+    """The sentence stays readable; the exception's attribute keeps all."""
+    contract = running_contract()
+    running = replace(contract, observations=contract.observations[::-1])
+    with pytest.raises(ContractMismatch, match=r"observations\[4\]: [^;]*; and 31 more$") as caught:
+        require_match(contract, running, "x.zip")
+    assert len(caught.value.differences) == 36
+    assert str(caught.value).count("expected") == 5
+
+
 def test_observation_names_and_order_count() -> None:
     """Two exchanged features are two differences."""
     contract = running_contract()
