@@ -8,6 +8,7 @@ stderr; stdout stays empty.
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import signal
 import sys
@@ -34,7 +35,7 @@ def main() -> int:
     except EngineError as error:
         return _say(error, 2)
     try:
-        serve(arguments.rendezvous, plant, arguments.attach_timeout)
+        serve(arguments.rendezvous, plant, arguments.attach_timeout, arguments.launcher)
     except SessionError as error:
         return _say(error, 2)
     except (ProtocolError, PhysicsServerError) as error:
@@ -68,11 +69,39 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--attach-timeout",
         metavar="SECONDS",
-        type=float,
+        type=_seconds,
         default=30.0,
         help="how long to wait for the agent to offer the session (default 30)",
     )
+    parser.add_argument(
+        "--launcher",
+        metavar="PID",
+        type=_pid,
+        help="end when this process ends before a session is offered",
+    )
     return parser
+
+
+def _seconds(text: str) -> float:
+    """Read a time that can pass: NaN and infinity would wait for ever."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not (math.isfinite(seconds) and seconds >= 0):
+        raise argparse.ArgumentTypeError(f"expected a finite time in seconds >= 0, found {text!r}")
+    return seconds
+
+
+def _pid(text: str) -> int:
+    """Read a process id."""
+    try:
+        pid = int(text)
+    except ValueError:
+        pid = 0
+    if not 1 <= pid < 2**31:
+        raise argparse.ArgumentTypeError(f"expected a process id >= 1, found {text!r}")
+    return pid
 
 
 def _say(error: Exception, status: int) -> int:

@@ -13,7 +13,7 @@ from protocol import layout
 from protocol.errors import HandshakeError, PeerLost, SessionError, Verdict
 from protocol.handshake import magic, owner, read_farewell
 from protocol.layout import COMMAND_MAGIC, POSE_MAGIC, Farewell
-from protocol.liveness import Life, life
+from protocol.liveness import UNKNOWN, Life, life, start_time
 from protocol.memory import (
     COMMAND_SUFFIX,
     POSE_SUFFIX,
@@ -99,17 +99,18 @@ def _remove_stale(rendezvous: Rendezvous, suffix: str, word: bytes, patient: boo
     return ""
 
 
-def attach_segments(rendezvous: Rendezvous, timeout: float) -> Segments:
+def attach_segments(rendezvous: Rendezvous, timeout: float, launcher: int | None = None) -> Segments:
     """Wait until an agent offers a session, then open its segments and claim the physics side.
 
     Segments of an agent that is dead are removed, those of one that has said farewell passed over: a new agent
     may come.
 
     Raises:
-        PeerLost: no session was offered within `timeout` seconds.
+        PeerLost: no session was offered within `timeout` seconds, or before the process `launcher` ended.
         SessionError: another physics process serves the session or has served it.
         HandshakeError: the pose segment is too small to be one.
     """
+    launched = UNKNOWN if launcher is None else start_time(launcher)
     began = whole = time.monotonic()
     found = "nothing of that name"
     while True:
@@ -120,6 +121,9 @@ def attach_segments(rendezvous: Rendezvous, timeout: float) -> Segments:
         if news != _UNFINISHED:
             whole = now  # the last moment without a half-written header
         found = news or found
+        if launcher is not None and life(launcher, launched) is Life.DEAD:
+            how = f"ended before a session was offered at {rendezvous}"
+            raise PeerLost(f"launcher (pid {launcher})", how, Verdict.EXITED, 0, "attach")
         if now - began > timeout:
             how = f"no session at {rendezvous} within {timeout} s, found {found}; is the agent running?"
             raise PeerLost("agent", how, Verdict.TOO_SLOW, 0, "attach")

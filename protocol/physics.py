@@ -42,21 +42,23 @@ _REPLY_REST_AT: Final = POSE["status"].offset
 _REPLY_DOORBELL: Final = POSE["doorbell"].word
 
 
-def serve(rendezvous: str, plant: Plant, attach_timeout: float = 30.0) -> None:
+def serve(rendezvous: str, plant: Plant, attach_timeout: float = 30.0, launcher: int | None = None) -> None:
     """Wait for the session that an agent offers at `rendezvous`, then answer its requests until it says goodbye.
 
     May be called before the agent has created the session. Closes the plant. Leaves a farewell for the agent
     whenever it ends otherwise than by the agent's goodbye, and removes the segments if the agent is dead by then.
+    `launcher` is the process that started this one: should it end before a session is offered, nobody waits for it.
 
     Raises:
         SessionError: the rendezvous cannot be used, or another physics process serves the session.
         HandshakeError: the agent's header is not what this version expects.
         PeerViolation: the agent broke the protocol.
-        PeerLost: the agent died or left, or no session appeared within `attach_timeout` seconds.
+        PeerLost: the agent died or left, or no session appeared within `attach_timeout` seconds or before
+            the launcher ended.
         Exception: whatever the plant raised; the agent is told.
     """
     try:
-        segments = attach_segments(parse_rendezvous(rendezvous), attach_timeout)
+        segments = attach_segments(parse_rendezvous(rendezvous), attach_timeout, launcher)
         try:
             _serve_attached(segments.command.view, segments.pose.view, plant)
         finally:

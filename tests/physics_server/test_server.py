@@ -161,6 +161,16 @@ def test_a_signal_ends_it_and_the_agent_is_told(
         (("nowhere",), 2, "expected shm:NAME or file:/path/stem, found 'nowhere'"),
         (("shm:test-physics-none", "--engine", "unity"), 2, "invalid choice: 'unity'"),
         (("shm:test-physics-none", "--attach-timeout", "0.1"), 3, "test-physics-none"),
+        (("shm:test-physics-none", "--attach-timeout", "nan"), 2, "finite time in seconds >= 0, found 'nan'"),
+        (("shm:test-physics-none", "--attach-timeout", "inf"), 2, "finite time in seconds >= 0, found 'inf'"),
+        (("shm:test-physics-none", "--attach-timeout", "-1"), 2, "finite time in seconds >= 0, found '-1'"),
+        (
+            ("shm:test-physics-none", "--attach-timeout", "soon"),
+            2,
+            "finite time in seconds >= 0, found 'soon'",
+        ),
+        (("shm:test-physics-none", "--launcher", "0"), 2, "expected a process id >= 1, found '0'"),
+        (("shm:test-physics-none", "--launcher", "me"), 2, "expected a process id >= 1, found 'me'"),
     ],
 )
 def test_what_cannot_be_served_is_said(
@@ -172,6 +182,34 @@ def test_what_cannot_be_served_is_said(
     assert (process.returncode, out) == (status, "")
     assert said in err.splitlines()[-1]
     assert "Traceback" not in err
+
+
+def test_it_ends_with_its_launcher_before_a_session(start: Callable[..., Any], rendezvous: str) -> None:
+    """A launcher that is killed before it offers a session takes the process with it, long before its timeout."""
+    idle = "import sys; sys.stdin.read()"
+    with subprocess.Popen([sys.executable, "-c", idle], stdin=subprocess.PIPE) as launcher:
+        pid = str(launcher.pid)
+        process = start(rendezvous, "--engine", "null", "--attach-timeout", "600", "--launcher", pid)
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(1.0)
+        launcher.kill()
+        out, err = process.communicate(timeout=DEADLINE)
+    assert (process.returncode, out, err.count("\n")) == (3, "", 1)
+    assert f"lost launcher (pid {pid}) at step 0, phase attach: ended before a session was offered" in err
+    late = start(rendezvous, "--engine", "null", "--attach-timeout", "600", "--launcher", pid)
+    assert late.wait(DEADLINE) == 3
+
+
+def test_a_session_outlives_the_launcher(start: Callable[..., Any], rendezvous: str) -> None:
+    """Once the session is there it is the agent that counts, and the launcher may go."""
+    idle = "import sys; sys.stdin.read()"
+    with subprocess.Popen([sys.executable, "-c", idle], stdin=subprocess.PIPE) as launcher:
+        process = start(rendezvous, "--engine", "null", "--launcher", str(launcher.pid))
+        with AgentSession.open(rendezvous, SETTINGS, attach_timeout=DEADLINE) as session:
+            launcher.kill()
+            launcher.wait(DEADLINE)
+            assert session.reset(resets()).step.tolist() == [0, 0]
+    assert process.wait(DEADLINE) == 0
 
 
 def test_a_missing_engine_is_explained(start: Callable[..., Any], rendezvous: str) -> None:
