@@ -20,7 +20,7 @@ class SessionSettings:
     """What the agent asks of a session.
 
     Raises:
-        SessionError: a value is out of range, or `dt` is no whole multiple of `physics_dt`.
+        SessionError: a value is out of range, or `dt` is no whole multiple of `physics_dt` or too long a one.
     """
 
     lanes: int
@@ -39,6 +39,12 @@ class SessionSettings:
         for name in ("dt", "physics_dt"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise SessionError(f"{name}: expected a time in seconds > 0, found {getattr(self, name)}")
+        steps, most = self.dt / self.physics_dt, layout.INNER_STEPS_MAX
+        if steps > most + 0.5:  # it may be infinite, which cannot be rounded
+            raise SessionError(
+                f"dt: expected at most {most} inner steps of physics_dt = {self.physics_dt:.12g} s, "
+                f"found {self.dt:.12g} s, {steps:.12g} of them; shorten dt or lengthen physics_dt"
+            )
         if not _is_multiple(self.dt, self.physics_dt, self.inner_steps):
             nearest = self.inner_steps * self.physics_dt
             raise SessionError(
@@ -93,8 +99,8 @@ def read_offer(view: memoryview) -> Offer:
     _demand("physics_dt", math.isfinite(physics_dt) and physics_dt > 0, "a time > 0 s", physics_dt)
     _demand(
         "inner_steps",
-        inner_steps >= 1 and _is_multiple(dt, physics_dt, inner_steps),
-        f"dt / physics_dt = {dt / physics_dt:.12g}, a whole number",
+        1 <= inner_steps <= layout.INNER_STEPS_MAX and _is_multiple(dt, physics_dt, inner_steps),
+        f"dt / physics_dt = {dt / physics_dt:.12g}, a whole number up to {layout.INNER_STEPS_MAX}",
         inner_steps,
     )
     for name, stride in (

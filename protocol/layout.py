@@ -29,6 +29,7 @@ RESET_STRIDE: Final = RESET_WORDS * WORD
 
 LANES_MAX: Final = 65_536
 TUBE_SLOTS_MAX: Final = 65_536
+INNER_STEPS_MAX: Final = 1_000_000
 
 
 class Op(IntEnum):
@@ -106,7 +107,13 @@ HEADER: Final[tuple[Field, ...]] = (
     Field(64, "lanes", "i64", 1, "N, number of lanes, 1 to 65536"),
     Field(72, "dt", "f64", 1, "control step (s)"),
     Field(80, "physics_dt", "f64", 1, "inner step (s)"),
-    Field(88, "inner_steps", "i64", 1, "n, inner steps a control step; n physics_dt = dt within 1e-9 dt"),
+    Field(
+        88,
+        "inner_steps",
+        "i64",
+        1,
+        "n, inner steps a control step, 1 to 1000000; n physics_dt = dt within 1e-9 dt",
+    ),
     Field(96, "tube_slots", "i64", 1, "tube indices run from 0 to tube_slots - 1; 1 to 65536"),
     Field(104, "command_stride", "i64", 1, "bytes of a command row, 64"),
     Field(112, "pose_stride", "i64", 1, "bytes of a pose row, 128"),

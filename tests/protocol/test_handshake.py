@@ -75,6 +75,15 @@ def test_physics_refuses_a_wrong_header_of_the_agent(name: str, value: int | flo
     assert not any(pair.pose[:8])
 
 
+def test_physics_refuses_an_absurd_number_of_inner_steps() -> None:
+    """A whole number of inner steps that nobody could wait for is refused, though it fits the two times."""
+    pair = Pair()
+    spoil(pair.command, "dt", 2_000_000 * 0.025)
+    spoil(pair.command, "inner_steps", 2_000_000)
+    with pytest.raises(HandshakeError, match="a whole number up to 1000000"):
+        PhysicsSession(pair.command, pair.pose, ToyPlant())
+
+
 def test_physics_refuses_more_lanes_than_the_segment_holds() -> None:
     """A lane count that the stated size does not fit is refused by size."""
     pair = Pair()

@@ -434,7 +434,15 @@ def test_every_transport_gives_the_twins_poses(open_session: Open, resets: Reset
         ((0, 0.1, 0.1, 1), "lanes: expected 1 to 65536, found 0"),
         ((1, 0.1, 0.1, 0), "tube_slots"),
         ((1, math.nan, 0.1, 1), "dt: expected a time"),
+        ((1, math.inf, 0.1, 1), "dt: expected a time"),
         ((1, 0.1, -0.1, 1), "physics_dt: expected a time"),
+        ((1, 0.1, math.nan, 1), "physics_dt: expected a time"),
+        (
+            (1, 1e9, 0.1, 1),
+            r"at most 1000000 inner steps of physics_dt = 0.1 s, found 1000000000 s, 10000000000 of",
+        ),
+        ((1, 1.000001, 1e-6, 1), "at most 1000000 inner steps"),
+        ((1, 1e300, 1e-300, 1), "at most 1000000 inner steps .* inf of them"),
         ((1, 0.11, 0.02, 1), r"whole multiple of physics_dt = 0.02 s, found 0.11 s; the nearest is 0.1"),
         ((1, 0.01, 0.02, 1), r"the nearest is 0.02 s \(1 inner steps\)"),
     ],
@@ -443,3 +451,8 @@ def test_settings_that_make_no_session(values: tuple[int, float, float, int], me
     """Impossible settings are refused before anything is created; a dt that is no multiple names the nearest."""
     with pytest.raises(SessionError, match=message):
         SessionSettings(*values)
+
+
+def test_the_most_inner_steps() -> None:
+    """A million inner steps are still allowed."""
+    assert SessionSettings(1, 1.0, 1e-6).inner_steps == 1_000_000
