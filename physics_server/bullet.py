@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import numpy as np
 
 from meshes.geometry import Floats
 from physics_server.bullet_world import ENGINE, INDICES_MAX, VERTICES_MAX, WORLDS_MAX, BodyState, World
 from physics_server.errors import EngineError
-from physics_server.law import control_law, gust_force
+from physics_server.law import control_law, gust_force, travel_bound
 from physics_server.parameters import BodyParameters, description
 from physics_server.walls import AGREEMENT, RegisteredWall, read_registered, ring_around
 from protocol.errors import Refusal
@@ -33,6 +34,11 @@ class _Lane:
         self.seed = 0
         self.steps = 0
         self.state = BodyState((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+CONTACT_MARGIN: Final = 0.05
+"""Contacts are not watched where the wall is further than the body can get in the control step, and this (m)
+further still: more than any margin that the engine keeps around a triangle."""
 
 
 class BulletPlant(Plant):
@@ -110,7 +116,17 @@ class BulletPlant(Plant):
             dx, dy, dz, speed, compensation = command[:5]
             gust = gust_force(lane.body.gust, lane.seed, lane.steps)
             law = control_law(lane.body, (dx, dy, dz), speed, compensation, gust)
-            lane.state, touched = lane.world.integrate(lane.state, law, self._inner_steps)
+            furthest = travel_bound(
+                lane.body,
+                lane.state.linear_velocity,
+                speed,
+                compensation,
+                gust,
+                self._physics_dt,
+                self._inner_steps,
+            )
+            watch = not lane.world.far_from_wall(furthest + CONTACT_MARGIN)
+            lane.state, touched = lane.world.integrate(lane.state, law, self._inner_steps, watch)
             self._write(number, touched, poses)
 
     def close(self) -> None:

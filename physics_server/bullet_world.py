@@ -90,6 +90,10 @@ class BodyState(NamedTuple):
     angular_velocity: Vector
 
 
+CLOSE_STEPS: Final = 16
+"""Control steps in which contacts are watched without asking how far the wall is, once it was near."""
+
+
 class World:
     """One client of the engine: the wall of at most one tube, and at most one body.
 
@@ -104,6 +108,8 @@ class World:
         if self._client < 0:
             raise EngineError(f"{ENGINE}: expected a further world, found no room for one; use fewer lanes")
         self._body = -1
+        self._first_wall = -1
+        self._close = 0
         self._pieces = 0
         self.build(None)
 
@@ -122,7 +128,7 @@ class World:
         )
         pieces = [] if wall is None else wall.pieces
         for piece in pieces:
-            _add_static(client, piece)
+            self._first_wall = _add_static(client, piece)
         self.wall, self._body, self._pieces = wall, -1, len(pieces)
 
     def place(self, wall: RegisteredWall | None, body: BodyParameters, state: BodyState) -> BodyState:
@@ -138,6 +144,7 @@ class World:
         elif self._body >= 0:
             pybullet.removeBody(self._body, physicsClientId=client)
         self._body = drone = _add_body(client, body)
+        self._close = 0
         pybullet.setGravity(0.0, 0.0, -body.gravity, physicsClientId=client)
         pybullet.resetBasePositionAndOrientation(
             drone, state.position, state.quaternion, physicsClientId=client
@@ -149,7 +156,28 @@ class World:
         linear, angular = pybullet.getBaseVelocity(drone, physicsClientId=client)
         return BodyState(position, quaternion, linear, angular)
 
-    def integrate(self, state: BodyState, law: Law, inner_steps: int) -> tuple[BodyState, int]:
+    def far_from_wall(self, distance: float) -> bool:
+        """Whether the wall is known to be further than `distance` (m) from the body's surface.
+
+        Asking takes 2 us where the wall is far, but hundreds where many triangles are near: after a no it is
+        not asked again for CLOSE_STEPS calls, and the answer is no meanwhile. Of a wall in several pieces it is
+        always no.
+        """
+        if self._pieces != 1:
+            return self._pieces == 0
+        if self._close > 0:
+            self._close -= 1
+            return False
+        near = pybullet.getClosestPoints(
+            self._body, self._first_wall, distance, -1, -1, physicsClientId=self._client
+        )
+        if near:
+            self._close = CLOSE_STEPS
+        return not near
+
+    def integrate(
+        self, state: BodyState, law: Law, inner_steps: int, watch_contacts: bool = True
+    ) -> tuple[BodyState, int]:
         """Take inner steps under a law; returns the new state, and in how many of them the body touched.
 
         The innermost loop of the project: names are bound locally and arguments are positional, which saves a
@@ -159,6 +187,7 @@ class World:
             state: where the body stands, as the last call left it.
             law: force (world frame) and torque (body frame) from the state.
             inner_steps: how many.
+            watch_contacts: False where no contact is possible, which saves asking for it after every inner step.
         """
         position, quaternion, velocity, omega = state
         client, drone = self._client, self._body
@@ -172,11 +201,12 @@ class World:
             apply_force(drone, -1, force, position, world, client)
             apply_torque(drone, -1, torque, body, client)
             simulate(client)
-            # The engine also lists points that are near: at a distance of 0 or less they touch.
-            for contact in contact_points(drone, -1, -2, -2, client):
-                if contact[_DISTANCE] <= 0.0:
-                    touched += 1
-                    break
+            if watch_contacts:
+                # The engine also lists points that are near: at a distance of 0 or less they touch.
+                for contact in contact_points(drone, -1, -2, -2, client):
+                    if contact[_DISTANCE] <= 0.0:
+                        touched += 1
+                        break
             position, quaternion = get_pose(drone, client)
             velocity, omega = get_velocity(drone, client)
         return BodyState(position, quaternion, velocity, omega), touched
@@ -194,8 +224,8 @@ class World:
         pybullet.disconnect(physicsClientId=self._client)
 
 
-def _add_static(client: int, piece: Piece) -> None:
-    """Put one piece of wall into a world."""
+def _add_static(client: int, piece: Piece) -> int:
+    """Put one piece of wall into a world; returns its id."""
     shape = pybullet.createCollisionShape(
         pybullet.GEOM_MESH,
         vertices=piece.vertices,
@@ -203,11 +233,12 @@ def _add_static(client: int, piece: Piece) -> None:
         flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
         physicsClientId=client,
     )
-    wall = pybullet.createMultiBody(0.0, shape, physicsClientId=client)
+    wall: int = pybullet.createMultiBody(0.0, shape, physicsClientId=client)
     # The engine multiplies the coefficients of both bodies: 1 here leaves the lane's parameters as they are.
     pybullet.changeDynamics(
         wall, -1, restitution=1.0, lateralFriction=1.0, contactProcessingThreshold=0.0, physicsClientId=client
     )
+    return wall
 
 
 def _add_body(client: int, body: BodyParameters) -> int:

@@ -6,6 +6,7 @@ than the whole law.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Final
 
@@ -78,6 +79,41 @@ def control_law(
         return force, torque
 
     return law
+
+
+def travel_bound(
+    body: BodyParameters,
+    velocity: Vector,
+    speed: float,
+    compensation: float,
+    gust: Vector,
+    physics_dt: float,
+    inner_steps: int,
+) -> float:
+    """How far the body can get in one control step without touching anything (m).
+
+    What pushes is at most A = (thrust + disturbance + gust) / m + |c - 1| g, and what brakes only slows down, as
+    long as it takes no more than twice the speed away in one inner step h: then |v_k| <= |v_0| + k h A, and the
+    way of n semi-implicit steps is at most n h |v_0| + A h^2 n (n + 1) / 2. Infinite where braking is stiffer.
+
+    Args:
+        body: the lane's parameters.
+        velocity: at the beginning (m/s).
+        speed: commanded (m/s).
+        compensation: c of the command.
+        gust: force (N) over this control step.
+        physics_dt: h (s).
+        inner_steps: n.
+    """
+    mass = body.mass
+    if (mass * body.force_gain + body.linear_drag) * physics_dt > 2.0 * mass:
+        return math.inf
+    disturbance = abs(body.disturbance_x) + abs(body.disturbance_y) + abs(body.disturbance_z)
+    push = mass * body.force_gain * speed + disturbance + abs(gust[0]) + abs(gust[1]) + abs(gust[2])
+    acceleration = push / mass + abs((compensation - 1.0) * body.gravity)
+    start = math.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
+    n, h = inner_steps, physics_dt
+    return n * h * start + acceleration * h * h * n * (n + 1) / 2.0
 
 
 def gust_force(amplitude: float, seed: int, step: int) -> Vector:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import pytest
 
 from physics_server.bullet_world import CONTACT_ERP
+from physics_server.law import travel_bound
+from physics_server.parameters import BodyParameters
 from protocol.errors import Refusal
 
 INNER = 1 / 240
@@ -170,3 +173,46 @@ def test_a_solid_tube_is_refused(
         ),
     ):
         world.reset(tube=0, position=(5, 0, 0))
+
+
+def test_contacts_are_the_same_whether_they_are_watched_all_the_time_or_not(
+    rig: Callable[..., Any], tube_file: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A drone that is thrown about between the walls: every word of every pose agrees, contact counts too."""
+    rng = np.random.default_rng(3)
+    directions = rng.normal(size=(300, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    flights = []
+    for always in (False, True):
+        if always:
+            monkeypatch.setattr("physics_server.bullet_world.World.far_from_wall", lambda *_: False)
+        world = rig()
+        world.plant.register_tube(0, tube_file())
+        world.reset(tube=0, position=(10.0, 0, 0), gust=3.0, seed=5)
+        rows = []
+        for x, y, z in directions:
+            world.command((x, y, z), speed=4.0, compensation=0.9)
+            rows.append(world.step(1)[0])
+        flights.append(np.array(rows))
+    assert np.array_equal(flights[0], flights[1])
+    contacts = flights[0].view(np.int64)[:, 0, 14]
+    assert (contacts > 0).sum() > 10
+    assert (contacts == 0).sum() > 100
+
+
+def test_no_flight_gets_further_than_its_bound(rig: Callable[..., Any]) -> None:
+    """In free space, under any command and force, a control step's way stays within what was computed before it."""
+    rng = np.random.default_rng(4)
+    for _ in range(40):
+        body = BodyParameters(
+            mass=rng.uniform(0.3, 3.0), force_gain=rng.uniform(0.0, 20.0), linear_drag=rng.uniform(0.0, 2.0),
+            disturbance_x=rng.normal(), disturbance_z=rng.normal(), gravity=rng.uniform(-5.0, 12.0),
+        )  # fmt: skip
+        velocity = tuple(rng.normal(size=3) * 2.0)
+        direction = rng.normal(size=3)
+        speed, compensation = rng.uniform(0.0, 5.0), rng.uniform(0.0, 2.0)
+        world = rig()
+        world.reset(velocity=velocity, **asdict(body))
+        world.command(tuple(direction / np.linalg.norm(direction)), speed, compensation)
+        bound = travel_bound(body, velocity, speed, compensation, (0.0, 0.0, 0.0), INNER, 24)
+        assert np.linalg.norm(world.step(1)[0, 0, :3]) <= bound
