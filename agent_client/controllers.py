@@ -55,7 +55,9 @@ class PolicyController(Controller):
 
     def __init__(self, policy: ActingPolicy, settings: Settings) -> None:
         self.policy: Final = policy
-        self._table = action_table(settings)
+        self._table = table = action_table(settings)
+        # Loads compiled code before the first control step and not in it.
+        decode(np.zeros(1, np.int64), np.eye(3)[None], table.local, table.speed, np.zeros((1, 8)))
 
     def act(self, step: TaskStep, commands: CommandBatch, actions: Ints) -> None:
         """Ask the policy, and turn its actions from the local frame into the world's."""

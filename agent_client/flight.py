@@ -119,6 +119,7 @@ def fly(
     phases, totals = np.zeros((2, len(PHASES)), dtype=np.int64)
     poses = session.reset(resets)
     state = task.begin(np.arange(geometry.lanes), poses)
+    task.measure_clearance()  # loads compiled code, too, before the first step and not in it
     step = FlightStep(0, np.zeros_like(commands.raw), poses.raw, actions.copy(), state, phases)
     stopped = False
 

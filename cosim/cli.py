@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import traceback
 from pathlib import Path
 from types import FrameType
 from typing import Any, Final
@@ -11,7 +12,7 @@ from typing import Any, Final
 import click
 
 from cosim import __version__
-from cosim.errors import Terminated, exit_status
+from cosim.errors import INTERNAL, Terminated, exit_status
 from cosim.options import FlightOptions, flight_options
 
 EXIT_NO_SUCCESS: Final = 1
@@ -91,13 +92,17 @@ def bench(as_json: bool, quick: bool) -> None:
     run(as_json=as_json, quick=quick)
 
 
-def _terminated(_signal: int, _frame: FrameType | None) -> None:
-    raise Terminated
+def _interrupted(number: int, _frame: FrameType | None) -> None:
+    """Ctrl-C or SIGTERM: the first one ends the command in order, and another must not cut the cleaning up short."""
+    for deaf_to in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(deaf_to, signal.SIG_IGN)
+    raise KeyboardInterrupt if number == signal.SIGINT else Terminated
 
 
 def main() -> None:
     """Entry point of the console script; every error raised on purpose is one sentence on stderr."""
-    signal.signal(signal.SIGTERM, _terminated)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _interrupted)
     try:
         cosim.main(standalone_mode=False)
     except click.exceptions.Exit as done:
@@ -107,10 +112,12 @@ def main() -> None:
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)
-    except BaseException as error:  # exit statuses are given here and nowhere else
+    except BaseException as error:  # noqa: BLE001  exit statuses are given here and nowhere else
         status = exit_status(error)
         if status is None:
-            raise
+            traceback.print_exc()
+            click.echo(f"cosim: a fault of cosim itself ({type(error).__name__}); please report it", err=True)
+            sys.exit(INTERNAL)
         for line in (f"cosim: {error}" if str(error) else "", *getattr(error, "__notes__", ())):
             if line:
                 click.echo(line, err=True)

@@ -18,6 +18,9 @@ from typing import Final
 
 USAGE: Final = 2
 PEER: Final = 3
+INTERNAL: Final = 70
+"""A fault of our own: 1 means "no success" and nothing else."""
+BROKEN_PIPE: Final = 141
 INTERRUPTED: Final = 130
 TERMINATED: Final = 143
 
@@ -50,6 +53,8 @@ def exit_status(error: BaseException) -> int | None:
 
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED
+    if isinstance(error, BrokenPipeError):
+        return BROKEN_PIPE
     if isinstance(error, Terminated):
         return TERMINATED
     if isinstance(error, (CosimError, MeshError, AgentError, SessionError)):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import CosimError, OutputError
-from cosim.recording import Column
+from cosim.recording import LOG, MANIFEST, Column
 from cosim.runs import Run, read_run
 
 CHUNK: Final = 8192
@@ -31,10 +31,19 @@ def export(folder: Path, kind: str, output: Path | None = None) -> Path:
     """
     run = read_run(folder)
     target = output if output is not None else folder / f"steps.{kind}"
+    for own in (MANIFEST, LOG):
+        if target.resolve() == (folder / own).resolve():
+            raise OutputError(
+                f"{target}: expected a file that is no part of the run, found the run's own {own}"
+            )
+    partial = target.with_name(f"{target.name}.partial")
     try:
-        WRITERS[kind](run, target)
+        WRITERS[kind](run, partial)
+        partial.replace(target)
     except OSError as error:
         raise OutputError(f"{target} cannot be written: {error.strerror}") from error
+    finally:
+        partial.unlink(missing_ok=True)
     return target
 
 

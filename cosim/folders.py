@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import itertools
 import os
-import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-from cosim.errors import USAGE, OutputError, exit_status
+from cosim.errors import PEER, OutputError, exit_status
 from cosim.recording import LOG, MANIFEST
+from cosim.supervise import LOGS
 
 
 def check_folder(out: Path | None) -> None:
@@ -26,7 +26,12 @@ def check_folder(out: Path | None) -> None:
             raise OutputError(
                 f"--out {out}: expected a folder without a run, found {name}: already a run there"
             )
-    nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    try:
+        nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    except OSError as error:
+        raise OutputError(
+            f"--out {folder}: the working directory cannot be used: {error.strerror}"
+        ) from error
     if not (nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)):
         raise OutputError(
             f"--out {folder}: expected a folder that can be written, found {nearest}, which cannot"
@@ -37,28 +42,44 @@ def check_folder(out: Path | None) -> None:
 def new_folder(out: Path | None, label: str) -> Iterator[Path]:
     """The run's folder: `out`, or a new one under runs/ named by time (UTC) and `label`.
 
-    It goes again where no flight began because of bad input, since then there is nothing to keep.
+    Where no flight began, because of bad input or Ctrl-C, everything that was made goes again. Where the
+    physics process failed, its logs are kept.
 
     Raises:
         OutputError: it cannot be created.
     """
-    folder = out if out is not None else _free_name(label)
-    existed = folder.exists()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"--out {folder}: cannot be created: {error.strerror}") from error
+    folder, made = _make(out) if out is not None else _make_free(label)
     try:
         yield folder
     except BaseException as error:
-        if exit_status(error) == USAGE and not existed and not (folder / MANIFEST).exists():
-            shutil.rmtree(folder)
+        if exit_status(error) != PEER and not (folder / MANIFEST).exists():
+            for name in LOGS:
+                (folder / name).unlink(missing_ok=True)
+            for path in made:
+                with suppress(OSError):  # not empty: something of the user's is in it
+                    path.rmdir()
         raise
 
 
-def _free_name(label: str) -> Path:
-    """A path under runs/ that does not exist."""
+def _make(folder: Path, *, new: bool = False) -> tuple[Path, list[Path]]:
+    """Create a folder; returns it, and which folders were made for it, the innermost first."""
+    made = [path for path in (folder, *folder.absolute().parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=not new)
+    except FileExistsError:
+        raise
+    except OSError as error:
+        raise OutputError(f"--out {folder}: cannot be created: {error.strerror}") from error
+    return folder, made
+
+
+def _make_free(label: str) -> tuple[Path, list[Path]]:
+    """Create a folder under runs/ that did not exist."""
     stamp = datetime.now(UTC).strftime("%Y-%m-%d-%H%M%S")
     stem = Path("runs") / f"{stamp}-{label}"
-    names = itertools.chain([stem], (stem.with_name(f"{stem.name}-{n}") for n in itertools.count(2)))
-    return next(name for name in names if not name.exists())
+    for number in itertools.count(1):
+        try:
+            return _make(stem if number == 1 else stem.with_name(f"{stem.name}-{number}"), new=True)
+        except FileExistsError:
+            continue
+    raise AssertionError

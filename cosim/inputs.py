@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -11,13 +12,14 @@ from typing import Any, Final, Literal
 import agent_client
 from agent_client.contract import require_match, running_contract
 from agent_client.controllers import DEFAULT_LOOKAHEAD, Controller, PolicyController, PurePursuit
+from agent_client.errors import ContractMismatch
 from agent_client.policy import load_policy
 from agent_client.settings import DEFAULT_DT, Settings
 from cosim.errors import CosimError
 from cosim.options import SHIPPED_MESH, SHIPPED_POLICY, FlightOptions
 from meshes.mesh_geometry import MeshGeometry
 from meshes.tube import INDUSTRIAL, Axes, Tube, read_tube
-from protocol.plant import PARAMETER_INDEX
+from protocol.plant import PARAMETER_INDEX, PARAMETERS
 
 PURE_PURSUIT: Final = "pure-pursuit"
 SHIPPED_CHECKPOINT: Final = Path(agent_client.__file__).parent / "policies" / "tube_ppo.zip"
@@ -47,7 +49,8 @@ class Named:
     @property
     def label(self) -> str:
         """Names of tube and pilot for a folder."""
-        return f"{self.mesh.stem}-{PURE_PURSUIT if self.policy is None else self.policy.stem}"
+        pilot = PURE_PURSUIT if self.policy is None else self.policy.stem
+        return f"{self.mesh.stem[:60]}-{pilot[:60]}"
 
 
 def name_inputs(options: FlightOptions) -> Named:
@@ -69,8 +72,12 @@ def name_inputs(options: FlightOptions) -> Named:
         if name == shipped_name and not path.exists():
             path = shipped
             notes.append(f"{what}: {shipped_name} is the shipped one")
-        if not path.is_file():
-            raise CosimError(f"--{what} {name}: expected a file, found no such file")
+        try:
+            found = "a folder" if path.is_dir() else "" if path.is_file() else "no such file"
+        except OSError as error:
+            found = f"one that cannot be read: {error.strerror}"
+        if found:
+            raise CosimError(f"--{what} {name}: expected a file, found {found}")
         paths[what] = path
     mesh = paths["mesh"]
     assert mesh is not None
@@ -88,16 +95,20 @@ def read_tube_input(options: FlightOptions, named: Named) -> Tube:
     return read_tube(named.mesh, options.centerline, axes, options.scale, start_end)
 
 
-def read_pilot(options: FlightOptions, named: Named, geometry: MeshGeometry) -> Pilot:
+def read_pilot(
+    options: FlightOptions, named: Named, geometry: MeshGeometry, parameters: Mapping[str, float]
+) -> Pilot:
     """The controller that the options name, checked against what will run.
+
+    Naming a compensation or a body radius is allowing it; that it differs from the checkpoint's is said.
 
     Raises:
         AgentError: a checkpoint that cannot be read, or whose contract differs from what would run.
         CosimError: an option that this controller does not have.
     """
-    base = Settings()
-    if options.compensation is not None:
-        base = replace(base, drone=replace(base.drone, compensation=options.compensation))
+    chosen = {"compensation": options.compensation, "body_radius": parameters.get("body_radius")}
+    drone = {name: value for name, value in chosen.items() if value is not None}
+    base = replace(Settings(), drone=replace(Settings().drone, **drone))
     if named.policy is None:
         lookahead = DEFAULT_LOOKAHEAD if options.lookahead is None else options.lookahead
         pursuit = PurePursuit(geometry, base, lookahead=lookahead)
@@ -120,10 +131,13 @@ def read_pilot(options: FlightOptions, named: Named, geometry: MeshGeometry) -> 
     contract = policy.contract
     settings = replace(base, masked_features=contract.masked)
     dt = contract.dt if options.dt is None else options.dt
-    allowed = set(options.allow_mismatch)
-    if options.compensation is not None:
-        allowed.add("drone.compensation")  # naming a value is allowing it
-    mismatch = require_match(contract, running_contract(settings, dt), str(path), allowed)
+    allowed = {*options.allow_mismatch, *(f"drone.{name}" for name in drone)}
+    try:
+        mismatch = require_match(contract, running_contract(settings, dt), str(path), allowed)
+    except ContractMismatch as error:
+        if [difference.name for difference in error.differences] == ["dt"]:
+            error.add_note("--allow-mismatch dt flies it all the same")
+        raise
     notes = tuple(
         f"policy: {difference.name}: made for {difference.expected}, flown with {difference.found}"
         for difference in mismatch
@@ -145,7 +159,7 @@ def parse_parameters(pairs: tuple[str, ...]) -> dict[str, float]:
     """Plant parameters from NAME=VALUE pairs.
 
     Raises:
-        CosimError: an unknown name, or a value that is no finite number.
+        CosimError: an unknown name, or a value out of its range.
     """
     values = {}
     for pair in pairs:
@@ -153,10 +167,14 @@ def parse_parameters(pairs: tuple[str, ...]) -> dict[str, float]:
         if name not in PARAMETER_INDEX:
             known = ", ".join(PARAMETER_INDEX)
             raise CosimError(f"--parameter: expected NAME=VALUE with a name out of {known}; found {pair!r}")
+        parameter = PARAMETERS[PARAMETER_INDEX[name]]
         try:
-            values[name] = float(text)
+            value = float(text)
         except ValueError:
-            values[name] = math.nan
-        if not math.isfinite(values[name]):
-            raise CosimError(f"--parameter {name}: expected a finite number, found {text!r}")
+            value = math.nan
+        low, high = parameter.lowest, parameter.highest
+        fits = low < value if parameter.above_lowest else low <= value
+        if not (math.isfinite(value) and fits and value <= high and value in (parameter.either or (value,))):
+            raise CosimError(f"--parameter {name}: expected a number, {parameter.range}; found {text!r}")
+        values[name] = value
     return values

@@ -19,7 +19,7 @@ from agent_client.flight import FlightResult, FlightStep, fly
 from agent_client.settings import max_steps
 from agent_client.task import Outcome
 from cosim import __version__
-from cosim.errors import Terminated
+from cosim.errors import CosimError, Terminated
 from cosim.folders import check_folder, new_folder
 from cosim.inputs import Pilot, name_inputs, parse_parameters, read_pilot, read_tube_input
 from cosim.live import LiveLine
@@ -54,6 +54,10 @@ def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
         click.echo(text, err=as_json)
 
     check_folder(options.out)
+    if options.connect is not None and (options.server or options.session):
+        raise CosimError(
+            "--connect: a peer that you start has its own command and name; drop --server or --session"
+        )
     command = None if options.connect is not None else physics_command(options.server)
     parameters = parse_parameters(options.parameters)
     rendezvous = rendezvous_of(options.connect, options.session, options.transport)
@@ -69,7 +73,7 @@ def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
             process = stack.enter_context(PhysicsProcess(command, rendezvous, folder))
         tube = read_tube_input(options, named)
         geometry = MeshGeometry([tube])
-        pilot = read_pilot(options, named, geometry)
+        pilot = read_pilot(options, named, geometry, parameters)
         for note in pilot.notes:
             say(note)
         settings = SessionSettings(1, pilot.dt, options.physics_dt)

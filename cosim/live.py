@@ -17,7 +17,7 @@ class LiveLine:
         self._progress = None
         self._due = 0.0
         self._seen = (time.monotonic(), 0)
-        if enabled and sys.stderr.isatty():
+        if enabled and sys.stderr is not None and sys.stderr.isatty():
             # rich draws bars and degrades on dumb terminals; imported only where a line is drawn.
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TextColumn

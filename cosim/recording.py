@@ -12,7 +12,7 @@ import json
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from protocol.plant import COMMAND_WORDS, POSE_WORDS
 MANIFEST: Final = "manifest.json"
 LOG: Final = "steps.bin"
 FORMAT: Final = 1
-FLUSH_SECONDS: Final = 0.5
 
 COMMAND_BYTES: Final = 8 * COMMAND_WORDS
 POSE_BYTES: Final = 8 * POSE_WORDS
@@ -144,7 +143,7 @@ def next_link(chain: bytes, payload: bytes) -> bytes:
 
 
 class Recorder:
-    """Writes one flight of one lane, flushed at least every second, so that a crash loses no more.
+    """Writes one flight of one lane; every record is with the operating system before the next is made.
 
     Args:
         folder: the run folder, without a run in it.
@@ -176,12 +175,14 @@ class Recorder:
             "record": [asdict(column) for column in fields],
             "status": "running",
         }
-        self.write_manifest()
         try:
-            self._log: BinaryIO = (folder / LOG).open("xb", buffering=1 << 20)
+            # Unbuffered: what is written survives the death of this process, however it dies.
+            self._log = (folder / LOG).open("xb", buffering=0)
+        except FileExistsError as error:
+            raise OutputError(f"{folder / LOG}: expected no such file, found one: a run is there") from error
         except OSError as error:
             raise OutputError(f"{folder / LOG} cannot be written: {error.strerror}") from error
-        self._flushed = time.monotonic()
+        self.write_manifest()
 
     @property
     def trajectory_hash(self) -> str:
@@ -200,16 +201,14 @@ class Recorder:
         self._observation[:] = step.task.observation[0]
         # As bytes: copied field by field it would take ten times as long.
         self._episode[:] = step.task.episodes.view(np.uint8)
-        self._log.write(self._record)
+        try:
+            self._log.write(self._record)
+        except OSError as error:
+            raise OutputError(
+                f"{self.folder / LOG} cannot be written: {error.strerror}; {self.records} records stand"
+            ) from error
         self.records += 1
-        if time.monotonic() - self._flushed > FLUSH_SECONDS:
-            self.flush()
         self._recording[0] = time.perf_counter_ns() - started
-
-    def flush(self) -> None:
-        """Hand what is buffered to the operating system: it survives the death of this process."""
-        self._log.flush()
-        self._flushed = time.monotonic()
 
     def write_manifest(self) -> None:
         """Write the manifest so that a reader finds either the old one or the new one, whole."""
@@ -222,7 +221,7 @@ class Recorder:
             raise OutputError(f"{path} cannot be written: {error.strerror}") from error
 
     def close(self, status: str, outcome: dict[str, Any]) -> None:
-        """Flush, close and say in the manifest how the run ended."""
+        """Close, and say in the manifest how the run ended."""
         self._log.close()
         self.manifest["status"] = status
         self.manifest["records"] = self.records

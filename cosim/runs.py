@@ -36,7 +36,7 @@ def read_run(folder: Path) -> Run:
         manifest = json.loads(path.read_text())
     except OSError as error:
         raise RunError(f"{path}: expected the manifest of a run, found none ({error.strerror})") from error
-    except json.JSONDecodeError as error:
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise RunError(f"{path}: expected JSON, found text that is not ({error})") from error
     found = manifest.get("format") if isinstance(manifest, dict) else None
     if found != FORMAT:

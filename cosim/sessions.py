@@ -22,11 +22,13 @@ def rendezvous_of(connect: str | None, name: str | None, transport: str) -> str:
         CosimError: a name that no transport can carry.
     """
     if connect is not None:
-        return connect if ":" in connect else f"{transport}:{connect}"
+        if ":" in connect:
+            return connect
+        name = connect
     if name is None:
         name = f"cosim-{os.getpid()}-{time.time_ns() % 1_000_000_000:09d}"
     if Path(name).name != name:
-        raise CosimError(f"--session: expected a name without a folder, found {name!r}")
+        raise CosimError(f"--session or --connect: expected a name without a folder, found {name!r}")
     return f"shm:{name}" if transport == "shm" else f"file:{Path(tempfile.gettempdir()) / name}"
 
 
@@ -53,6 +55,8 @@ def physics_session(
     watch = None if process is None else process.watch
     try:
         with AgentSession.open(rendezvous, settings, watch=watch, attach_timeout=attach_timeout) as session:
+            if process is not None:
+                process.serving = True
             yield session
     except ProtocolError as error:
         if process is not None and (words := process.last_words()):

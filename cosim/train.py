@@ -40,6 +40,10 @@ def train(preset: str, steps: int | None, seed: int, envs: int, out: Path) -> No
         ) from error
 
     path = out / CHECKPOINT
+    if path.exists():
+        raise OutputError(
+            f"--out {out}: expected a folder without a policy, found {path}; name another folder"
+        )
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -54,7 +58,7 @@ def train(preset: str, steps: int | None, seed: int, envs: int, out: Path) -> No
         hyperparameters=replace(options.hyperparameters, lanes=envs),
         tensorboard=out / "tensorboard",
     )
-    live = sys.stderr.isatty()
+    live = sys.stderr is not None and sys.stderr.isatty()
 
     def show(progress: Progress) -> None:
         rate = "   -" if math.isnan(progress.success_rate) else f"{100.0 * progress.success_rate:4.0f}"
@@ -69,7 +73,12 @@ def train(preset: str, steps: int | None, seed: int, envs: int, out: Path) -> No
     click.echo(
         f"training '{preset}' for {options.steps:,} steps; drawing tubes and compiling first", err=True
     )
-    written = run(options, show)
+    try:
+        written = run(options, show)
+    except BaseException:
+        kept = f"its last checkpoint is {path}" if path.exists() else "no checkpoint was written yet"
+        click.echo(f"\ntraining ended early; {kept}", err=True)
+        raise
     if live:
         click.echo(err=True)
     click.echo(f"{written}")

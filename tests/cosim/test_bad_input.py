@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from flights import DEADLINE, Done, command, environment
+from flights import DEADLINE, Done, command, environment, run_cosim
 
 SQUARE_TUBE = """v 0 1 1\nv 0 -1 1\nv 0 -1 -1\nv 0 1 -1\nv 9 1 1\nv 9 -1 1\nv 9 -1 -1\nv 9 1 -1
 f 1 2 6 5\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8\n"""
@@ -129,11 +129,27 @@ def test_no_room_in_shared_memory(tmp_path: Path, session_name: str) -> None:
     refused(Done(done.returncode, done.stdout, done.stderr), tmp_path, "no room", "/dev/shm")
 
 
+def test_bad_input_leaves_no_folder_behind(tmp_path: Path) -> None:
+    """Not even the runs/ that a first run would have made, and no log in a folder of the user's."""
+    mesh = tube(tmp_path, "v 0 5 0\nv 9 5 0\nl 1 2\n")
+    (tmp_path / "mine").mkdir()
+    before = sorted(tmp_path.rglob("*"))
+    for out in ((), ("--out", "new/deep"), ("--out", "mine")):
+        assert run_cosim("launch", "--mesh", mesh, *out, cwd=tmp_path).status == 2
+        assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_values_out_of_range(fly: Callable[..., Done], tmp_path: Path) -> None:
     """Options with impossible values are refused before anything is started."""
     refused(fly("--scale", "-1"), tmp_path, "--scale")
     refused(fly("--parameter", "mess=1"), tmp_path, "mess", "mass")
     refused(fly("--parameter", "mass=heavy"), tmp_path, "mass", "heavy")
+    refused(fly("--parameter", "mass=-1"), tmp_path, "mass", "> 0")
+    refused(fly("--parameter", "restitution=2"), tmp_path, "restitution", "0 to 1")
     refused(fly("--compensation", "3"), tmp_path, "compensation")
+    refused(fly("--seed", str(2**64)), tmp_path, "--seed")
+    refused(fly("--server", "'x"), tmp_path, "--server")
+    refused(fly("--connect", "x", "--server", "y"), tmp_path, "--connect")
+    refused(fly("--mesh", str(tmp_path)), tmp_path, "a folder")
     refused(fly("--server", "/no/such/program"), tmp_path, "/no/such/program")
     refused(fly("--session", "a/b"), tmp_path, "a/b")

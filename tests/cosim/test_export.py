@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from flights import Done
 
-from cosim.errors import RunError
+from cosim.errors import OutputError, RunError
 from cosim.export import export
 from cosim.runs import Run, read_run
 
@@ -69,6 +69,15 @@ def test_parquet_is_read_back_by_pyarrow_with_units(run: Run, tmp_path: Path) ->
     assert table["position_x"].to_pylist() == run.records["position"][:, 0].tolist()
     assert table.schema.field("position_x").metadata == {b"unit": b"m", b"frame": b"world"}
     assert json.loads(table.schema.metadata[b"cosim.manifest"])["format"] == 1
+
+
+def test_an_export_never_replaces_the_run_itself(run: Run) -> None:
+    """The log and the manifest are refused as targets, and stay as they are."""
+    before = (run.folder / "steps.bin").read_bytes()
+    for own in ("steps.bin", "manifest.json"):
+        with pytest.raises(OutputError, match="run's own"):
+            export(run.folder, "csv", run.folder / own)
+    assert (run.folder / "steps.bin").read_bytes() == before
 
 
 def test_a_log_cut_short_ends_with_its_last_whole_record(run: Run, tmp_path: Path) -> None:

@@ -82,6 +82,29 @@ def test_ctrl_c_saves_the_run_and_ends_both_processes(session_name: str, tmp_pat
     assert run.manifest["records"] == len(run.records) >= 5
 
 
+def test_impatience_changes_nothing(session_name: str, tmp_path: Path) -> None:
+    """A second and third Ctrl-C while a stopped physics process is being ended: it is ended all the same."""
+    folder = tmp_path / "run"
+    with flying(session_name, folder) as process:
+        physics = physics_pid(folder)
+        os.kill(physics, signal.SIGSTOP)
+        for _ in range(3):
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.3)
+        process.communicate(timeout=DEADLINE)
+        assert process.returncode == 130
+    assert gone(physics)
+
+
+def test_what_a_server_started_itself_is_ended_too(fly: Callable[..., Done], tmp_path: Path) -> None:
+    """A physics command that is a script: its children do not outlive the launch."""
+    script = tmp_path / "server.sh"
+    script.write_text(f"sleep 600 & echo $! > {tmp_path}/pid; wait\n")
+    done = fly("--server", f"sh {script}", "--attach-timeout", "2")
+    assert done.status == 3, done.stderr
+    assert gone(int((tmp_path / "pid").read_text()))
+
+
 def test_sigterm_ends_both_processes(session_name: str, tmp_path: Path) -> None:
     """SIGTERM is handled like Ctrl-C and exits with 143."""
     folder = tmp_path / "run"

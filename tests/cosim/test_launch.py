@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from flights import Done
+from flights import DEADLINE, Done, environment
 
 KEYS = {
     "outcome", "steps", "sim_time_s", "wall_time_s", "steps_per_second", "progress", "quality",
@@ -94,11 +96,41 @@ def test_what_was_chosen_for_the_user_is_said(fly: Callable[..., Done], tmp_path
     assert manifest["options"]["max_steps"] == 2
 
 
+def test_a_larger_body_has_a_smaller_gap(fly: Callable[..., Done], tmp_path: Path) -> None:
+    """A body radius that is named reaches physics, sensors and the reported gap, and is said to differ."""
+    options = ("--max-steps", "2", "--policy")
+    usual = fly(*options, "pure-pursuit", out="usual").report["min_clearance_m"]
+    large = fly(*options, "pure-pursuit", "--parameter", "body_radius=0.3", out="large").report
+    assert large["min_clearance_m"] == pytest.approx(usual - 0.15, abs=1e-6)
+    done = fly(*options, "tube_ppo", "--parameter", "body_radius=0.3", out="policy")
+    assert "drone.body_radius: made for 0.15, flown with 0.3" in done.stderr
+
+
+def test_files_of_the_users_folder_are_not_taken_for_modules(
+    fly: Callable[..., Done], tmp_path: Path
+) -> None:
+    """A random.py or protocol.py beside the user's data does not reach the physics process."""
+    for name in ("random.py", "protocol.py"):
+        (tmp_path / name).write_text("raise SystemExit('shadowed')\n")
+    code = "import sys; sys.path.pop(0); from cosim.cli import main; sys.argv[0] = 'cosim'; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "launch", "--json", "--max-steps", "2", "--out", "run"],
+        check=False,
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=environment(),
+        timeout=DEADLINE,
+    )
+    assert done.returncode == 0, done.stderr
+
+
 def test_another_control_step_must_be_allowed(fly: Callable[..., Done], tmp_path: Path) -> None:
     """A dt that differs from the checkpoint's is refused, and flown and recorded under --allow-mismatch dt."""
     refused = fly("--dt", "0.05", "--max-steps", "4", out="refused")
     assert refused.status == 2
     assert "dt: expected 0.1, found 0.05" in refused.stderr
+    assert "--allow-mismatch dt" in refused.stderr
     allowed = fly("--dt", "0.05", "--allow-mismatch", "dt", "--max-steps", "4", out="allowed")
     assert allowed.report["sim_time_s"] == pytest.approx(0.2)
     manifest = json.loads((tmp_path / "allowed" / "manifest.json").read_text())
