@@ -112,6 +112,8 @@ def main() -> None:
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)
+    except SystemExit:
+        raise
     except BaseException as error:  # noqa: BLE001  exit statuses are given here and nowhere else
         status = exit_status(error)
         if status is None:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flights import DEADLINE, ROOT, Done, command, environment, leftovers
+from flights import DEADLINE, ROOT, Done, command, environment, leftovers, run_cosim
 
 from cosim.runs import read_run
 
@@ -160,9 +160,7 @@ def test_a_paused_process_gives_the_same_flight(fly: Callable[..., Done], tmp_pa
     assert Done(0, stdout, stderr).report["trajectory_hash"] == undisturbed
 
 
-def test_a_peer_started_by_hand_is_waited_for_and_not_killed(
-    fly: Callable[..., Done], session_name: str
-) -> None:
+def test_a_peer_started_by_hand_is_waited_for_and_not_killed(tmp_path: Path, session_name: str) -> None:
     """--connect flies with a server that somebody else started, and does not kill it."""
     server = subprocess.Popen(
         [sys.executable, "-m", "physics_server", f"shm:{session_name}", "--attach-timeout", "60"],
@@ -170,7 +168,8 @@ def test_a_peer_started_by_hand_is_waited_for_and_not_killed(
         stderr=subprocess.PIPE,
     )
     try:
-        done = fly("--connect", f"shm:{session_name}", "--max-steps", "3")
+        connect = ("--connect", f"shm:{session_name}", "--out", str(tmp_path / "run"))
+        done = run_cosim("launch", *connect, "--max-steps", "3", cwd=tmp_path)
         assert done.status == 0, done.stderr
         assert server.wait(DEADLINE) == 0  # it left by itself after the goodbye
     finally:
