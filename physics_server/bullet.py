@@ -10,7 +10,7 @@ import numpy as np
 from meshes.geometry import Floats
 from physics_server.bullet_world import ENGINE, INDICES_MAX, VERTICES_MAX, WORLDS_MAX, BodyState, World
 from physics_server.errors import EngineError
-from physics_server.law import control_law, gust_force, travel_bound
+from physics_server.law import control_law, gust_force, torque_in_world, travel_bound
 from physics_server.parameters import BodyParameters, description
 from physics_server.walls import AGREEMENT, RegisteredWall, read_registered, ring_around
 from protocol.errors import Refusal
@@ -126,7 +126,9 @@ class BulletPlant(Plant):
                 self._inner_steps,
             )
             watch = not lane.world.far_from_wall(furthest + CONTACT_MARGIN)
-            lane.state, touched = lane.world.integrate(lane.state, law, self._inner_steps, watch)
+            lane.state, touched = lane.world.integrate(
+                lane.state, law, self._inner_steps, watch, torque_in_world(lane.body)
+            )
             self._write(number, touched, poses)
 
     def close(self) -> None:

@@ -176,7 +176,12 @@ class World:
         return not near
 
     def integrate(
-        self, state: BodyState, law: Law, inner_steps: int, watch_contacts: bool = True
+        self,
+        state: BodyState,
+        law: Law,
+        inner_steps: int,
+        watch_contacts: bool = True,
+        torque_in_world: bool = False,
     ) -> tuple[BodyState, int]:
         """Take inner steps under a law; returns the new state, and in how many of them the body touched.
 
@@ -185,13 +190,15 @@ class World:
 
         Args:
             state: where the body stands, as the last call left it.
-            law: force (world frame) and torque (body frame) from the state.
+            law: force (world frame) and torque from the state.
             inner_steps: how many.
+            torque_in_world: whether the torque is in the world frame, else in the body frame.
             watch_contacts: False where no contact is possible, which saves asking for it after every inner step.
         """
         position, quaternion, velocity, omega = state
         client, drone = self._client, self._body
-        world, body = pybullet.WORLD_FRAME, pybullet.LINK_FRAME
+        world = pybullet.WORLD_FRAME
+        torque_frame = world if torque_in_world else pybullet.LINK_FRAME
         apply_force, apply_torque = pybullet.applyExternalForce, pybullet.applyExternalTorque
         simulate, contact_points = pybullet.stepSimulation, pybullet.getContactPoints
         get_pose, get_velocity = pybullet.getBasePositionAndOrientation, pybullet.getBaseVelocity
@@ -199,7 +206,7 @@ class World:
         for _ in range(inner_steps):
             force, torque = law(quaternion, velocity, omega)
             apply_force(drone, -1, force, position, world, client)
-            apply_torque(drone, -1, torque, body, client)
+            apply_torque(drone, -1, torque, torque_frame, client)
             simulate(client)
             if watch_contacts:
                 # The engine also lists points that are near: at a distance of 0 or less they touch.

@@ -15,9 +15,17 @@ from physics_server.parameters import BodyParameters
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Law = Callable[[Quaternion, Vector, Vector], tuple[Vector, Vector]]
-"""Quaternion, linear and angular velocity (world) -> force (N, world), torque (N m, body frame)."""
+"""Quaternion, linear and angular velocity (world) -> force (N, world), torque (N m, frame of `torque_in_world`)."""
 
 _MASK: Final = 2**64 - 1
+
+
+def torque_in_world(body: BodyParameters) -> bool:
+    """Whether the law of this body gives its torque in the world frame; else it is in the body frame.
+
+    With three equal moments I is the same in every frame, and the world frame needs a third of the arithmetic.
+    """
+    return body.inertia_x == body.inertia_y == body.inertia_z
 
 
 def control_law(
@@ -33,7 +41,8 @@ def control_law(
     Physical Model") names F_cmd and tau_cmd and leaves their form open; this form is our choice.
 
     In the body frame f = (1, 0, 0), so that f x d = (0, -d_z, d_y) and I is diagonal: the torque is given in
-    that frame, and the rotation of I into the world is never made.
+    that frame, or where I is the same in all frames in the world's (`torque_in_world`), and the rotation of I
+    into the world is never made.
 
     Args:
         body: the lane's parameters.
@@ -54,6 +63,28 @@ def control_law(
     damp_x = body.inertia_x * body.torque_kd + body.angular_drag
     damp_y = body.inertia_y * body.torque_kd + body.angular_drag
     damp_z = body.inertia_z * body.torque_kd + body.angular_drag
+
+    if torque_in_world(body):
+
+        def isotropic(quaternion: Quaternion, velocity: Vector, omega: Vector) -> tuple[Vector, Vector]:
+            x, y, z, w = quaternion
+            vx, vy, vz = velocity
+            ox, oy, oz = omega
+            y2, z2 = y + y, z + z
+            ax, ay, az = 1.0 - y * y2 - z * z2, x * y2 + w * z2, x * z2 - w * y2  # the body's x axis
+            force = (
+                fx + along_body * ax - linear * vx,
+                fy + along_body * ay - linear * vy,
+                fz + along_body * az - linear * vz,
+            )
+            torque = (
+                spring_y * (ay * dz - az * dy) - damp_x * ox,
+                spring_y * (az * dx - ax * dz) - damp_x * oy,
+                spring_y * (ax * dy - ay * dx) - damp_x * oz,
+            )
+            return force, torque
+
+        return isotropic
 
     def law(quaternion: Quaternion, velocity: Vector, omega: Vector) -> tuple[Vector, Vector]:
         x, y, z, w = quaternion
