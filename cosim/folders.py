@@ -66,9 +66,9 @@ def _make(folder: Path, *, new: bool = False) -> tuple[Path, list[Path]]:
     made = [path for path in (folder, *folder.absolute().parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=not new)
-    except FileExistsError:
-        raise
     except OSError as error:
+        if new and isinstance(error, FileExistsError):
+            raise
         raise OutputError(f"--out {folder}: cannot be created: {error.strerror}") from error
     return folder, made
 

@@ -6,6 +6,7 @@ import json
 import os
 import platform
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
 from importlib import metadata
@@ -17,6 +18,7 @@ import click
 from agent_client.episodes import episode_dtype
 from agent_client.flight import FlightResult, FlightStep, fly
 from agent_client.settings import max_steps
+from agent_client.start import build_resets
 from agent_client.task import Outcome
 from cosim import __version__
 from cosim.errors import CosimError, Terminated
@@ -102,6 +104,8 @@ def _fly_recorded(
     manifest: dict[str, Any],
 ) -> dict[str, Any]:
     """Fly with a recording that is closed whatever happens, and return the report."""
+    # Refuses a tube without room for the drone before anything is recorded.
+    build_resets(session.description, geometry, pilot.settings, [options.seed], parameters=parameters)
     recorder = Recorder(folder, manifest, episode_dtype(pilot.settings.lidar.rays))
     status, report = "failed", dict[str, Any]()
     try:
@@ -186,7 +190,7 @@ def _report(result: FlightResult, recorder: Recorder, pilot: Pilot, observer: _O
     }
 
 
-def _summarise(report: dict[str, Any], pilot: Pilot, tube: Tube, say: Any) -> None:
+def _summarise(report: dict[str, Any], pilot: Pilot, tube: Tube, say: Callable[[str], None]) -> None:
     """A short summary for people."""
     outcome = click.style(
         report["outcome"], fg="green" if report["outcome"] == "success" else "red", bold=True

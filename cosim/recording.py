@@ -7,8 +7,10 @@ over the payload rows as they crossed the protocol and never over timings; the l
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import os
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -202,7 +204,8 @@ class Recorder:
         # As bytes: copied field by field it would take ten times as long.
         self._episode[:] = step.task.episodes.view(np.uint8)
         try:
-            self._log.write(self._record)
+            if self._log.write(self._record) != len(self._record):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # a raw file may take half a record
         except OSError as error:
             raise OutputError(
                 f"{self.folder / LOG} cannot be written: {error.strerror}; {self.records} records stand"

@@ -76,6 +76,16 @@ def test_a_centreline_that_cannot_be_used(
     refused(fly("--mesh", tube(tmp_path, centreline)), tmp_path, *words)
 
 
+def test_a_tube_without_room_for_the_drone(fly: Callable[..., Done], tmp_path: Path) -> None:
+    """A tube that is narrower than the drone, or too short to fly through, is refused with nothing recorded."""
+    mesh = tube(tmp_path, "v 0.5 0 0\nv 8.5 0 0\nl 1 2\n")
+    for scale, word in (("0.12", "body's radius"), ("0.01", "expected")):
+        done = fly("--mesh", mesh, "--scale", scale)
+        assert done.status == 2, done.stderr
+        assert word in done.stderr
+        assert not (tmp_path / "run").exists()
+
+
 def test_a_named_centreline_that_is_missing(fly: Callable[..., Done], tmp_path: Path) -> None:
     """A centreline that was named is not replaced by another."""
     mesh = tube(tmp_path, "v 0 0 0\nv 9 0 0\nl 1 2\n")
