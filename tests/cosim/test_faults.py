@@ -50,8 +50,8 @@ def wait_until(holds: Callable[[], bool]) -> None:
 
 
 def recorded(folder: Path) -> int:
-    """Whole records on disk so far."""
-    return len(read_run(folder).records) if (folder / "steps.bin").exists() else 0
+    """Whole records on disk so far; none before the manifest, which is written after the log is opened."""
+    return len(read_run(folder).records) if (folder / "manifest.json").exists() else 0
 
 
 def physics_pid(folder: Path) -> int:
