@@ -49,6 +49,10 @@ def _plant(engine: str) -> Plant:
         from physics_server.null import NullPlant
 
         return NullPlant()
+    if engine == "reference":
+        from physics_server.reference import ReferencePlant
+
+        return ReferencePlant()
     from physics_server.bullet import BulletPlant
 
     return BulletPlant()
@@ -62,9 +66,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("rendezvous", metavar="RENDEZVOUS", help="shm:NAME or file:/path/stem")
     parser.add_argument(
         "--engine",
-        choices=("bullet", "null"),
+        choices=("bullet", "reference", "null"),
         default="bullet",
-        help="bullet: PyBullet (default); null: answers at once and moves nothing, for benchmarks",
+        help="bullet: PyBullet (default); reference: a fast rigid body without any walls, which refuses tubes; "
+        "null: answers at once and moves nothing, for benchmarks",
     )
     parser.add_argument(
         "--attach-timeout",
