@@ -144,7 +144,7 @@ def test_training_and_evaluation_draw_different_tubes() -> None:
 
 def test_a_recipe_keeps_its_ranges() -> None:
     """Radii stay within the mean's range times one plus or minus the swing; lengths are over the mean radius."""
-    recipe = TubeRecipe((10.0, 20.0), (0.8, 1.2), 0.15)
+    recipe = TubeRecipe((10.0, 20.0), (0.8, 1.2), (0.0, 0.15))
     tubes = [draw_tube(2, (1, i), "train", recipe) for i in range(40)]
     radii = np.concatenate([tube.radius for tube in tubes])
     assert radii.min() >= 0.8 * 0.85
