@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from agent_client.episodes import Records
+from agent_client.noise import blinded
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -47,12 +48,13 @@ def look(lanes: Ints, episodes: Records, constants: Records, targets: Floats, fr
         up = x * e.frame[1, 0] + y * e.frame[1, 1] + z * e.frame[1, 2]
         right = x * e.frame[2, 0] + y * e.frame[2, 1] + z * e.frame[2, 2]
         # Half-angles are below a right angle, so that nothing behind the camera passes.
-        in_view = abs(math.atan2(right, ahead)) <= half_width and abs(math.atan2(up, ahead)) <= half_height
+        width, height = half_width * e.field_of_view, half_height * e.field_of_view
+        in_view = abs(math.atan2(right, ahead)) <= width and abs(math.atan2(up, ahead)) <= height
         for c in range(3):
             e.target_position[c] = targets[i, c]
         e.target_direction[0], e.target_direction[1], e.target_direction[2] = x, y, z
         e.target_distance = distance
-        e.target_visible = in_view and free[i] >= distance
+        e.target_visible = in_view and free[i] >= distance and not blinded(e)
 
 
 @njit(cache=True)

@@ -74,7 +74,7 @@ class TubeVecEnv(VecEnv):
         self._geometry = SweptGeometry([tube for pool in pools for tube in pool], lanes)
         self._sizes = [len(pool) for pool in pools]
         self._first = np.concatenate([[0], np.cumsum(self._sizes)]).tolist()
-        self._task = TubeTask(self._geometry, settings, session.dt, kinematic=True)
+        self._task = TubeTask(self._geometry, settings, session.dt, clearance_contact=True)
         self._table = action_table(settings)
         self._commands = CommandBatch.zeros(lanes)
         self._commands.compensation[:] = settings.drone.compensation

@@ -8,7 +8,6 @@ it would not notice; therefore the record of the constants carries a digest of t
 from __future__ import annotations
 
 import hashlib
-import math
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
@@ -26,7 +25,10 @@ LIDAR_SUMMARY = ("h_f", "v_f", "h_r", "v_r", "S_F", "S_R", "mu_F", "mu_R", "l_mi
 """Fields of an episode that sum up its LiDAR, by the names of the paper; distances are over the range."""
 
 
-_COMPILED: Final = ("camera.py", "features.py", "frames.py", "judge.py", "lidar.py", "reward.py")
+SENSED: Final = ("body_radius", "field_of_view", "lidar_noise", "lidar_dropout", "camera_dropout")
+"""Conditions (`agent_client.conditions`) that perception works under, by their names."""
+
+_COMPILED: Final = ("camera.py", "features.py", "frames.py", "judge.py", "lidar.py", "noise.py", "reward.py")
 """Files whose compiled functions `agent_client.perception` calls."""
 
 
@@ -75,19 +77,23 @@ def episode_dtype(rays: int) -> np.dtype[np.void]:
             ("contact", "?"),
             ("target_visible", "?"),
             ("memory_available", "?"),
+            # The conditions of the episode (`agent_client.conditions`) that perception needs, and the seed of
+            # its sensors' noise.
+            *((name, "f8") for name in SENSED),
+            ("observation_delay", "i8"),
+            ("noise_seed", "u8"),
         ],
         align=True,
     )
 
 
-def constants(settings: Settings, dt: float, *, kinematic: bool, on_contact: OnContact) -> Records:
+def constants(settings: Settings, dt: float, *, clearance_contact: bool, on_contact: OnContact) -> Records:
     """The constants of the task as an array of one record, (1,); arguments as for `TubeTask`."""
     s = settings
     values: dict[str, float] = {
         "v_max": s.speed_max,
-        "body_radius": s.drone.body_radius,
-        # The clearance below which the body touches the wall; where physics reports contact, none.
-        "touch": s.drone.body_radius if kinematic else -math.inf,
+        # 1: the body touches the wall where the clearance is below its radius; 0: where physics reports it.
+        "clearance_contact": float(clearance_contact),
         "end_on_contact": float(on_contact == "end"),
         "lidar_offset": s.lidar.offset,
         "lidar_reach": s.lidar.reach,

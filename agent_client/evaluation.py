@@ -41,7 +41,7 @@ def evaluate(
     settings: Settings,
     *,
     seed: int,
-    kinematic: bool,
+    clearance_contact: bool,
 ) -> Score:
     """Fly every tube once from a random start.
 
@@ -51,11 +51,18 @@ def evaluate(
         make_controller: makes who flies, given the tubes.
         settings: constants of the task.
         seed: of the starts; lane i has a seed of its own made of it.
-        kinematic: whether contact is known from the clearance rather than from physics.
+        clearance_contact: whether contact is known from the clearance rather than from physics.
     """
     geometry = SweptGeometry(tubes, len(tubes))
     seeds = np.random.SeedSequence(seed).generate_state(len(tubes), np.uint32).tolist()
-    result = fly(session, geometry, make_controller(geometry), settings, seeds=seeds, kinematic=kinematic)
+    result = fly(
+        session,
+        geometry,
+        make_controller(geometry),
+        settings,
+        seeds=seeds,
+        clearance_contact=clearance_contact,
+    )
     return summarise(result, geometry.length, settings.speed_max * session.dt)
 
 

@@ -148,7 +148,7 @@ def compute_features(
         o[28] = 1.0 if e.target_visible else -1.0
         o[29] = 2.0 * e.memory_age / constant.memory_steps - 1.0
         o[33] = 1.0 if e.memory_available else -1.0
-        o[34] = (e.l_min * constant.lidar_reach - constant.body_radius) / constant.safety_scale
+        o[34] = (e.l_min * constant.lidar_reach - e.body_radius) / constant.safety_scale
         o[35] = 1.0 if e.inside else -1.0
         o[36] = 2.0 * e.step / e.max_steps - 1.0
         for c in range(o.shape[0]):

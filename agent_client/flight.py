@@ -83,7 +83,7 @@ def fly(
     seeds: Sequence[int],
     tube: int = NO_TUBE,
     parameters: Mapping[str, float] | None = None,
-    kinematic: bool = False,
+    clearance_contact: bool = False,
     on_contact: OnContact = "end",
     step_limit: int | None = None,
     on_step: Callable[[FlightStep], bool | None] | None = None,
@@ -100,7 +100,7 @@ def fly(
         seeds: (N,) one a lane, of its start and of the plant's disturbance.
         tube: index of the registered tube that physics resets the lanes into.
         parameters: plant parameters by name that differ from the plant's defaults.
-        kinematic: whether contact is known from the clearance rather than from physics.
+        clearance_contact: whether contact is known from the clearance rather than from physics.
         on_contact: "end" or "continue", see `TubeTask`.
         step_limit: control steps until a time-out, None for the limit of each tube.
         on_step: called after the reset and for each control step; returning True ends the flight after the
@@ -111,7 +111,12 @@ def fly(
         protocol.errors.ProtocolError: the session failed, or physics refused a reset or command.
     """
     task = TubeTask(
-        geometry, settings, session.dt, kinematic=kinematic, on_contact=on_contact, step_limit=step_limit
+        geometry,
+        settings,
+        session.dt,
+        clearance_contact=clearance_contact,
+        on_contact=on_contact,
+        step_limit=step_limit,
     )
     resets = build_resets(session.description, geometry, settings, seeds, tube=tube, parameters=parameters)
     commands = CommandBatch.zeros(geometry.lanes)

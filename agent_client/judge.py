@@ -41,7 +41,7 @@ def place(
     near: Floats,
     fresh: bool,
 ) -> None:
-    """Take over what the geometry found.
+    """Count the step, and take over what the geometry found.
 
     Args:
         lanes: (K,) the lanes to compute.
@@ -62,6 +62,7 @@ def place(
         for c in range(3):
             e.axis_position[c], e.tangent[c] = position[i, c], tangent[i, c]
             along += (e.position[c] - position[i, c]) * tangent[i, c]
+        e.step += 0 if fresh else 1
         if fresh:
             e.speed_before, e.arc_before = e.speed, arc_length[i]
         else:
@@ -86,7 +87,7 @@ def note_clearance(lanes: Ints, episodes: Records, clearance: Floats) -> None:
 
 @njit(cache=True)
 def judge(lanes: Ints, episodes: Records, constants: Records, words: Ints) -> None:
-    """Count the step, decide how each episode stands after it, and renew its quality index.
+    """Decide how each episode stands after its step, and renew its quality index.
 
     Several ends in one step rank collision, success, exit, timeout: a body that leaves through the wall has
     touched it. Success is measured along the axis and holds inside the tube, or past its end where the drone
@@ -103,7 +104,6 @@ def judge(lanes: Ints, episodes: Records, constants: Records, words: Ints) -> No
     for k in range(lanes.shape[0]):
         i = lanes[k]
         e = episodes[i]
-        e.step += 1
         along, square = 0.0, 0.0
         for c in range(3):
             offset = e.position[c] - e.axis_position[c]
@@ -113,7 +113,8 @@ def judge(lanes: Ints, episodes: Records, constants: Records, words: Ints) -> No
         through_end = in_opening and along > 0.0 and e.arc_length >= e.length - 1e-9
         through_start = in_opening and along < 0.0 and e.arc_length <= 1e-9
         near_end = e.length - e.arc_length <= constant.success_radius * e.radius
-        e.contact = words[i, 14] > 0 or (e.clearance < constant.touch and not (through_end or through_start))
+        touches = constant.clearance_contact > 0.0 and e.clearance < e.body_radius
+        e.contact = words[i, 14] > 0 or (touches and not (through_end or through_start))
         if e.contact:
             e.contacts += 1
         if e.contact and constant.end_on_contact > 0.0:

@@ -16,6 +16,7 @@ from agent_client.features import compute_features
 from agent_client.frames import take_poses
 from agent_client.judge import judge, place
 from agent_client.lidar import place_rays, read_rings
+from agent_client.noise import disturb
 from agent_client.reward import choose_regimes, score
 
 Floats = NDArray[np.float64]
@@ -96,6 +97,7 @@ def assess(
         lanes, episodes, arc_length, axis_position, tangent, radial_distance, radius, distances[:, sight + 1],
         near, fresh,
     )  # fmt: skip
+    disturb(lanes, episodes, constants, distances, sectors.shape[0])
     read_rings(lanes, episodes, constants, distances, sectors)
     look(lanes, episodes, constants, targets, distances[:, sight])
     remember(lanes, episodes, constants)

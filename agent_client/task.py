@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agent_client.episodes import OnContact, Records, constants, episode_dtype
+from agent_client.episodes import SENSED, OnContact, Records, constants, episode_dtype
 from agent_client.errors import SettingsError
 from agent_client.features import FEATURES, feature_mask
 from agent_client.judge import Outcome, note_clearance
@@ -122,8 +122,8 @@ class TubeTask:
         geometry: the tubes; its lanes are the task's.
         settings: constants of the task.
         dt: control step (s).
-        kinematic: how contact is known: True, the clearance falls below the body's radius (the kinematic
-            world has no walls); False, the poses report it.
+        clearance_contact: how contact is known: True, the clearance falls below the body's radius (for plants
+            without walls); False, the poses report it.
         on_contact: "end" ends an episode with COLLISION, "continue" counts contacts and lets the rest decide.
         step_limit: control steps after which an episode times out, None for `max_steps` of each tube.
 
@@ -137,7 +137,7 @@ class TubeTask:
         settings: Settings,
         dt: float,
         *,
-        kinematic: bool,
+        clearance_contact: bool,
         on_contact: OnContact = "end",
         step_limit: int | None = None,
     ) -> None:
@@ -150,12 +150,12 @@ class TubeTask:
         self.ray_nanoseconds = 0
         """How long rays and lines of sight took in the last call."""
         self._step_limit = step_limit
-        self._kinematic = kinematic
+        self._clearance_contact = clearance_contact
         self._target_distance = settings.camera.target_distance
         # One reach for all rays. The target lies no further away than its arc length and the offset from the
         # axis together: twice the arc length reaches it in any tube of R up to that length.
         self._reach = max(settings.lidar.reach, 2.0 * self._target_distance)
-        self._constants = constants(settings, dt, kinematic=kinematic, on_contact=on_contact)
+        self._constants = constants(settings, dt, clearance_contact=clearance_contact, on_contact=on_contact)
         self._mask = feature_mask(settings.masked_features)
         self._episodes: Records = np.zeros(n, dtype=episode_dtype(rays))
         self._episodes["max_steps"] = 1
@@ -175,12 +175,14 @@ class TubeTask:
         """Number of episodes N."""
         return self.geometry.lanes
 
-    def begin(self, lanes: Ints, poses: PoseBatch) -> TaskStep:
+    def begin(self, lanes: Ints, poses: PoseBatch, drawn: Records | None = None) -> TaskStep:
         """Start new episodes in some lanes, in the geometry's present tubes, and take their first look.
 
         Args:
             lanes: (K,) distinct lane indices.
             poses: (N,) poses; those of other lanes have no effect.
+            drawn: (K,) conditions of the episodes (`agent_client.conditions.draw_conditions`), None for the
+                settings' body and sensors without noise.
 
         Returns:
             The step of all lanes; other lanes' rows are as they were.
@@ -193,6 +195,13 @@ class TubeTask:
         episodes["max_steps"][lanes] = limits
         episodes["memory_age"][lanes] = self.settings.memory.steps + 1
         episodes["min_clearance"][lanes] = np.inf
+        if drawn is None:
+            episodes["body_radius"][lanes] = self.settings.drone.body_radius
+            episodes["field_of_view"][lanes] = 1.0
+        else:
+            for name in (*SENSED, "observation_delay"):
+                episodes[name][lanes] = drawn[name]
+            episodes["noise_seed"][lanes] = drawn["seed"]
         self._near[lanes] = np.nan
         active = None
         if len(lanes) < self.lanes:
@@ -228,7 +237,7 @@ class TubeTask:
         distances = geometry.rays(origins, directions, self._reach, active)
         self.ray_nanoseconds = time.perf_counter_ns() - started
         self._unmeasured = lanes
-        if self._kinematic:
+        if self._clearance_contact:
             self.measure_clearance()
         assess(
             lanes, episodes, constant, raw.view(np.int64), axis.arc_length, axis.position, axis.tangent,
@@ -241,7 +250,7 @@ class TubeTask:
 
         Where physics reports contact no decision depends on them, and they take as long as the rest of
         perception: `begin` and `observe` then leave them as they were, and whoever wants them calls this after
-        each, best while physics works. In the kinematic world they are always up to date.
+        each, best while physics works. Where contact is judged by them they are always up to date.
         """
         if len(self._unmeasured):
             clearance = self.geometry.clearance(self._position, self._axis)

@@ -17,7 +17,7 @@ Maker = Callable[..., Any]
 
 def begin(geometry: Any, poses: Any, settings: Settings | None = None) -> TubeTask:
     """A task whose episodes have just begun."""
-    task = TubeTask(geometry, settings or Settings(), 0.1, kinematic=True)
+    task = TubeTask(geometry, settings or Settings(), 0.1, clearance_contact=True)
     task.begin(np.arange(geometry.lanes), poses)
     return task
 

@@ -21,7 +21,7 @@ Maker = Callable[..., Any]
 
 def first_look(geometry: Any, poses: Any) -> TaskStep:
     """The step of an episode that begins here."""
-    return TubeTask(geometry, Settings(), 0.1, kinematic=True).begin(np.arange(geometry.lanes), poses)
+    return TubeTask(geometry, Settings(), 0.1, clearance_contact=True).begin(np.arange(geometry.lanes), poses)
 
 
 def test_pure_pursuit_heads_for_the_axis_point_ahead(cylinder: Maker, poses_at: Maker) -> None:

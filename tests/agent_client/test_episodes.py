@@ -20,7 +20,7 @@ def test_every_compiled_neighbour_of_perception_is_in_the_digest() -> None:
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("agent_client.")
     }
     assert set(_COMPILED) == imported - {"episodes.py"}
-    record = constants(Settings(), 0.1, kinematic=True, on_contact="end")
+    record = constants(Settings(), 0.1, clearance_contact=True, on_contact="end")
     assert [name for name in record.dtype.names or () if name.startswith("sources_")]
 
 

@@ -28,7 +28,7 @@ def score_of(make_controller, level: int, episodes: int, recipe: TubeRecipe) -> 
     tubes = [draw_tube(level, (9, index), "evaluate", recipe) for index in range(episodes)]
     session_settings = SessionSettings(lanes=episodes, dt=0.1, physics_dt=0.1)
     with open_twin(KinematicPlant(), session_settings) as session:
-        return evaluate(session, tubes, make_controller, Settings(), seed=4, kinematic=True)
+        return evaluate(session, tubes, make_controller, Settings(), seed=4, clearance_contact=True)
 
 
 def test_a_score_counts_outcomes_and_compares_lengths_of_successes_alone() -> None:

@@ -118,7 +118,7 @@ def test_features_agree_with_the_plain_formulation(cylinder: Maker, lanes: int) 
     """Random poses, any attitude, over a whole episode of 40 steps: equal to float32 rounding."""
     rng = np.random.default_rng(11)
     tube = cylinder(lanes=lanes, radius=1.1)
-    task = TubeTask(tube, Settings(), 0.1, kinematic=False, on_contact="continue", step_limit=500)
+    task = TubeTask(tube, Settings(), 0.1, clearance_contact=False, on_contact="continue", step_limit=500)
     oracles = [Oracle(1.1, 20.0, 500) for _ in range(lanes)]
     attitude = Rotation.random(lanes, random_state=5)
     for t in range(41):
@@ -141,7 +141,7 @@ def test_features_agree_with_the_plain_formulation(cylinder: Maker, lanes: int) 
 def test_features_outside_of_the_tube_stay_in_range(cylinder: Maker, poses_at: Maker) -> None:
     """Far outside, every feature is finite and in [-1, 1], and `inside` is -1."""
     poses = poses_at([25.0, 3.0, -4.0], (0.3, 1.0, 0.2), speed=30.0)
-    task = TubeTask(cylinder(), Settings(), 0.1, kinematic=False)
+    task = TubeTask(cylinder(), Settings(), 0.1, clearance_contact=False)
     step = task.begin(np.array([0]), poses)
     assert np.isfinite(step.observation).all()
     assert np.abs(step.observation).max() <= 1.0
@@ -152,8 +152,8 @@ def test_masked_features_stay_in_place_and_read_zero(cylinder: Maker, poses_at: 
     """Masking changes the named features alone."""
     poses = poses_at([5.0, 0.2, 0.1], (1.0, 0.1, 0.0), speed=1.0)
     masked = ("progress", "position_f", "position_u", "position_r")
-    seen = TubeTask(cylinder(), Settings(), 0.1, kinematic=False).begin(np.array([0]), poses)
-    blind = TubeTask(cylinder(), Settings(masked_features=masked), 0.1, kinematic=False).begin(
+    seen = TubeTask(cylinder(), Settings(), 0.1, clearance_contact=False).begin(np.array([0]), poses)
+    blind = TubeTask(cylinder(), Settings(masked_features=masked), 0.1, clearance_contact=False).begin(
         np.array([0]), poses
     )
     for i, name in enumerate(FEATURE_NAMES):
@@ -163,4 +163,4 @@ def test_masked_features_stay_in_place_and_read_zero(cylinder: Maker, poses_at: 
 def test_an_unknown_masked_feature_is_refused(cylinder: Maker) -> None:
     """A misspelt name does not silently mask nothing."""
     with pytest.raises(SettingsError, match=r"masked_features: expected .* found \['progres'\]"):
-        TubeTask(cylinder(), Settings(masked_features=("progres",)), 0.1, kinematic=True)
+        TubeTask(cylinder(), Settings(masked_features=("progres",)), 0.1, clearance_contact=True)

@@ -60,7 +60,7 @@ def flight(
 ) -> FlightResult:
     """Fly through the kinematic twin."""
     settings = settings or Settings()
-    options = {"seeds": range(geometry.lanes), "kinematic": True, **options}
+    options = {"seeds": range(geometry.lanes), "clearance_contact": True, **options}
     with open_twin(KinematicPlant(settings), SessionSettings(geometry.lanes, dt, dt)) as session:
         return fly(session, geometry, controller, settings, **options)
 
@@ -223,4 +223,4 @@ def test_a_refused_command_ends_the_flight_with_the_plants_words(cylinder: Maker
         open_twin(KinematicPlant(Settings()), SessionSettings(1, 0.1, 0.1)) as session,
         pytest.raises(Refusal, match="speed in lane 0"),
     ):
-        fly(session, tube, PurePursuit(tube, fast), fast, seeds=[0], kinematic=True)
+        fly(session, tube, PurePursuit(tube, fast), fast, seeds=[0], clearance_contact=True)

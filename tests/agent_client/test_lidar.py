@@ -18,7 +18,7 @@ Maker = Callable[..., Any]
 
 def look(geometry: Any, poses: Any, settings: Settings | None = None) -> TaskStep:
     """The first look at a pose."""
-    task = TubeTask(geometry, settings or Settings(), 0.1, kinematic=True)
+    task = TubeTask(geometry, settings or Settings(), 0.1, clearance_contact=True)
     return task.begin(np.arange(geometry.lanes), poses)
 
 

@@ -48,7 +48,7 @@ def paper_reward(step: TaskStep, regime: Regime, s_align: float, warmup: bool) -
 def test_the_three_regimes_follow_the_papers_equations(cylinder: Maker, poses_at: Maker) -> None:
     """Seen, then remembered, then blind: the reward is the paper's in each, with S_align of that regime."""
     settings = replace(LITERAL, memory=MemorySettings(steps=3))
-    task = TubeTask(cylinder(), settings, 0.1, kinematic=True)
+    task = TubeTask(cylinder(), settings, 0.1, clearance_contact=True)
     ahead = np.array([0.9, 0.1, 0.2]) / np.linalg.norm([0.9, 0.1, 0.2])
     aside = np.array([0.5, 0.8, 0.1]) / np.linalg.norm([0.5, 0.8, 0.1])
     p = np.array([5.0, 0.25, -0.15])
@@ -66,7 +66,7 @@ def test_the_three_regimes_follow_the_papers_equations(cylinder: Maker, poses_at
 
 def test_the_warmup_bonus_ends_after_its_steps(cylinder: Maker, poses_at: Maker) -> None:
     """The first 10 control steps earn it, the eleventh does not; an episode anew earns it again."""
-    task = TubeTask(cylinder(), LITERAL, 0.1, kinematic=True)
+    task = TubeTask(cylinder(), LITERAL, 0.1, clearance_contact=True)
     poses = poses_at([5.0, 0.2, 0.0], (1.0, 0.1, 0.0))
     bonus = TERMS.index("warmup")
     for _ in range(2):
@@ -77,7 +77,7 @@ def test_the_warmup_bonus_ends_after_its_steps(cylinder: Maker, poses_at: Maker)
 
 def test_terms_sum_to_the_reward(cylinder: Maker, poses_at: Maker) -> None:
     """Every term is kept apart, the terminal one too."""
-    task = TubeTask(cylinder(), LITERAL, 0.1, kinematic=True)
+    task = TubeTask(cylinder(), LITERAL, 0.1, clearance_contact=True)
     task.begin(np.array([0]), poses_at([19.0, 0.1, 0.0]))
     for x in (19.2, 19.6):
         step = task.observe(poses_at([x, 0.1, 0.0]))
@@ -90,7 +90,7 @@ def test_per_metre_terms_are_the_literal_ones_times_progress_over_v_max_dt(
     cylinder: Maker, poses_at: Maker
 ) -> None:
     """Standing still earns nothing, top speed the literal reward, going back costs; the end pays in full."""
-    tasks = [TubeTask(cylinder(), s, 0.1, kinematic=True) for s in (LITERAL, Settings())]
+    tasks = [TubeTask(cylinder(), s, 0.1, clearance_contact=True) for s in (LITERAL, Settings())]
     for task in tasks:
         task.begin(np.array([0]), poses_at([5.0, 0.2, 0.0]))
     x = 5.0
@@ -118,7 +118,7 @@ def test_terminal_rewards(
 ) -> None:
     """+10 for success, -10 for exit and collision alike, -1 for a time-out."""
     limit = 1 if outcome is Outcome.TIMEOUT else 100
-    task = TubeTask(cylinder(), LITERAL, 0.1, kinematic=True, step_limit=limit)
+    task = TubeTask(cylinder(), LITERAL, 0.1, clearance_contact=True, step_limit=limit)
     task.begin(np.array([0]), poses_at(position))
     step = task.observe(poses_at(position))
     assert step.outcome[0] == outcome
