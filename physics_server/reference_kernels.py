@@ -1,8 +1,8 @@
 """The rigid body of `physics_server.reference`, compiled: law, inner steps and lanes in one call.
 
 The law is that of `physics_server.law`, in a second form: that one serves an engine, one lane and one inner step
-at a time on Python floats; here it stands inside of the innermost loop. `tests/physics_server/test_reference.py`
-ties the two, to rounding, and the gusts bit for bit.
+at a time on Python floats; here it stands inside of the innermost loop. `tests/physics_server/test_law.py` ties
+the two, forces and torques to rounding and gusts bit for bit.
 
 All rotation is reckoned in the body frame. An inner step turns the body about omega itself, which leaves the
 components of omega in the body frame as they are: "omega in the world frame, then the pose", as annex A of

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from physics_server.bullet import BulletPlant
 from physics_server.parameters import BodyParameters
-from protocol.plant import NO_TUBE, CommandBatch, PoseBatch, ResetBatch, TubeReference
+from protocol.plant import NO_TUBE, CommandBatch, Plant, PoseBatch, ResetBatch, TubeReference
 
 Floats = NDArray[np.float64]
 INNER = 1 / 240
@@ -55,10 +55,10 @@ def tube_file(tmp_path: Path) -> Callable[..., TubeReference]:
 
 
 class Rig:
-    """A Bullet plant with the batches that a session would hold, one method a request."""
+    """A plant with the batches that a session would hold, one method a request."""
 
-    def __init__(self, lanes: int, inner_steps: int, physics_dt: float) -> None:
-        self.plant = BulletPlant()
+    def __init__(self, plant: Plant, lanes: int, inner_steps: int, physics_dt: float) -> None:
+        self.plant = plant
         self.plant.open(lanes, inner_steps * physics_dt, physics_dt, inner_steps)
         self.commands = CommandBatch.zeros(lanes)
         self.commands.direction[:, 0] = 1.0
@@ -135,11 +135,16 @@ def fill_tubes(monkeypatch: pytest.MonkeyPatch) -> Callable[[], AbstractContextM
 
 @pytest.fixture
 def rig() -> Iterator[Callable[..., Rig]]:
-    """Open a plant of `lanes` lanes and `inner_steps` inner steps of `physics_dt`; it is closed afterwards."""
+    """Open a plant of `lanes` lanes and `inner_steps` inner steps of `physics_dt`; it is closed afterwards.
+
+    It is Bullet's, or that of the class `plant`.
+    """
     opened: list[Rig] = []
 
-    def make(lanes: int = 1, inner_steps: int = 24, physics_dt: float = INNER) -> Rig:
-        opened.append(Rig(lanes, inner_steps, physics_dt))
+    def make(
+        lanes: int = 1, inner_steps: int = 24, physics_dt: float = INNER, plant: type[Plant] = BulletPlant
+    ) -> Rig:
+        opened.append(Rig(plant(), lanes, inner_steps, physics_dt))
         return opened[-1]
 
     yield make

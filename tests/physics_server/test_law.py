@@ -1,4 +1,4 @@
-"""The force and torque law against the equations of the annex, written with matrices."""
+"""The force and torque law, in both of its forms, against the equations of the annex, written with matrices."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from physics_server import reference_kernels as kernels
 from physics_server.law import control_law, gust_force, splitmix64, torque_in_world
 from physics_server.parameters import SPEED_MAX, BodyParameters
 from protocol import plant
@@ -61,7 +62,7 @@ def test_force_and_torque_are_the_equations(
     velocity: tuple[float, float, float],
     omega: tuple[float, float, float],
 ) -> None:
-    """Force and torque agree with the annex's equations in the world frame, with I rotated into the world."""
+    """Both forms of the law agree with the annex's equations, with I rotated into the world, and with each other."""
     force, torque = control_law(body, direction, speed, compensation, gust)(quaternion, velocity, omega)
 
     M = rotation(quaternion)
@@ -75,6 +76,12 @@ def test_force_and_torque_are_the_equations(
     np.testing.assert_allclose(force, F, rtol=1e-12, atol=1e-11)
     found = torque if torque_in_world(body) else M @ torque
     np.testing.assert_allclose(found, tau, rtol=1e-11, atol=1e-10)
+
+    row, command = np.array(body.row()), np.array([*direction, speed, compensation, 0, 0, 0])
+    constants = kernels.coefficients(row, command, gust)
+    compiled = kernels.force_and_torque(constants, quaternion, velocity, tuple(M.T @ w))
+    np.testing.assert_allclose(compiled[0], force, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(kernels.to_world(quaternion, compiled[1]), found, rtol=1e-12, atol=1e-12)
 
 
 def test_compensation_tilts_neither_direction_nor_torque() -> None:
@@ -101,6 +108,20 @@ def test_gusts_come_from_the_published_generator() -> None:
     golden = 0x9E3779B97F4A7C15
     outputs = [splitmix64(1234567 + k * golden) for k in range(3)]
     assert outputs == [6457827717110365317, 3203168211198807973, 9817491932198370423]
+
+
+def test_both_generators_are_the_same() -> None:
+    """The compiled generator and its gusts are those of the other form bit for bit, at every seed and step."""
+    rng = np.random.default_rng(0)
+    states = [0, 1, 2**63, 2**64 - 1, *rng.integers(2**64, size=200, dtype=np.uint64).tolist()]
+    assert [kernels.splitmix64(np.uint64(state)) for state in states] == [
+        splitmix64(state) for state in states
+    ]
+    for seed in (0, 1, -1, -3, 2**63 - 1, -(2**63), *rng.integers(-(2**63), 2**63 - 1, size=50).tolist()):
+        word = np.array([seed]).view(np.uint64)[0]
+        for step in (1, 2, 400, 10**9):
+            assert kernels.gust_force(0.7, word, step) == gust_force(0.7, seed, step)
+    assert kernels.gust_force(0.0, np.uint64(7), 1) == (0.0, 0.0, 0.0)
 
 
 def test_a_gust_depends_on_seed_and_step_alone() -> None:

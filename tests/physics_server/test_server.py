@@ -16,6 +16,7 @@ import pytest
 from physics_server.bullet import BulletPlant
 from physics_server.null import NullPlant
 from physics_server.parameters import BodyParameters
+from physics_server.reference import ReferencePlant
 from protocol.agent import AgentSession, SessionSettings
 from protocol.errors import PeerLost, Refusal
 from protocol.plant import NO_TUBE, CommandBatch, ResetBatch
@@ -137,6 +138,32 @@ def test_the_null_engine_counts_and_moves_nothing(start: Callable[..., Any], ren
     assert process.wait(DEADLINE) == 0
 
 
+def test_the_reference_engine_flies_as_in_this_process(
+    start: Callable[..., Any], rendezvous: str, tube_file: Callable[..., Any]
+) -> None:
+    """With --engine reference a tube is refused, and free flight is the twin's to the byte."""
+    command = CommandBatch.zeros(2)
+    command.direction[:] = [0.8, 0.6, 0.0]
+    command.speed[:] = 1.5
+
+    def fly_free(session: AgentSession) -> list[bytes]:
+        with pytest.raises(Refusal, match="reference 1 has no walls"):
+            session.register_tube(0, tube_file())
+        poses = [session.reset(resets()).raw.tobytes()]
+        return poses + [session.step(command).raw.tobytes() for _ in range(30)]
+
+    with open_twin(ReferencePlant(), SETTINGS) as twin:
+        expected = fly_free(twin)
+        described = twin.description
+    process = start(rendezvous, "--engine", "reference")
+    with AgentSession.open(rendezvous, SETTINGS, attach_timeout=DEADLINE) as session:
+        assert session.description == described
+        assert session.description.engine == "reference 1"
+        assert fly_free(session) == expected
+    out, err = process.communicate(timeout=DEADLINE)
+    assert (process.returncode, out, err) == (0, "", "")
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_it_and_the_agent_is_told(
     start: Callable[..., Any], rendezvous: str, number: signal.Signals
@@ -224,7 +251,7 @@ def test_a_missing_engine_is_explained(start: Callable[..., Any], rendezvous: st
 def test_starting_imports_only_what_flying_needs() -> None:
     """The process starts without numba, trimesh, scipy or torch: it is ready in a fraction of a second."""
     code = (
-        "import sys, physics_server.bullet; "
+        "import sys, physics_server.__main__, physics_server.bullet; "
         "print([m for m in ('numba', 'trimesh', 'scipy', 'torch', 'agent_client', 'cosim') if m in sys.modules])"
     )
     done = subprocess.run(

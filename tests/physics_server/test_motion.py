@@ -1,8 +1,9 @@
-"""Bullet's free motion against closed forms of its own integration scheme, and against exact solutions."""
+"""Free motion in both engines against closed forms of their integration scheme, and against exact solutions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,14 +11,22 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from physics_server.bullet import BulletPlant
 from physics_server.errors import EngineError
 from physics_server.law import gust_force
+from physics_server.reference import ReferencePlant
 from protocol.plant import CommandBatch
 
 INNER = 1 / 240
 LIMP = {"force_gain": 0.0, "torque_kp": 0.0, "torque_kd": 0.0}
 """No commanded force or torque."""
 TILTED = tuple(Rotation.from_euler("xyz", [0.3, 0.5, 1.2]).as_quat().tolist())
+
+
+@pytest.fixture(params=[BulletPlant, ReferencePlant])
+def rig(rig: Callable[..., Any], request: pytest.FixtureRequest) -> Callable[..., Any]:
+    """Every test of this file is one of both engines."""
+    return partial(rig, plant=request.param)
 
 
 def test_a_fall_is_the_semi_implicit_sum(rig: Callable[..., Any]) -> None:
