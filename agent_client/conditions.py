@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent_client.errors import SettingsError
+from protocol.plant import PARAMETER_INDEX, ResetBatch
 
 Range = tuple[float, float]
 Records = NDArray[Any]
@@ -146,6 +147,9 @@ HARD: Final = Conditions(
 """The hard conditions; their tubes are `agent_client.tubes.HARD_TUBES`."""
 
 
+_TAG: Final = 0xC04D  # enters the seed, so that conditions do not follow the draws of tubes and starts
+
+
 def draw_conditions(conditions: Conditions, seeds: Sequence[Sequence[int]]) -> Records:
     """Draw the conditions of episodes, (K,) records of DRAWN; an episode's depend on its seed alone.
 
@@ -167,4 +171,14 @@ def draw_conditions(conditions: Conditions, seeds: Sequence[Sequence[int]]) -> R
     return drawn
 
 
-_TAG: Final = 0xC04D  # enters the seed, so that conditions do not follow the draws of tubes and starts
+def apply_parameters(resets: ResetBatch, lanes: NDArray[np.int64], drawn: Records) -> None:
+    """Write the conditions that are plant parameters, and the seed of the gusts, into the rows of resets.
+
+    Args:
+        resets: to be filled in.
+        lanes: (K,) lane indices.
+        drawn: (K,) conditions of their episodes.
+    """
+    for name, parameter in PARAMETERS_OF.items():
+        resets.parameters[lanes, PARAMETER_INDEX[parameter]] = drawn[name]
+    resets.seed[lanes] = drawn["seed"].astype(np.int64)

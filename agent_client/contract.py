@@ -7,6 +7,7 @@ all of this as `contract.json`, and a difference is refused before the first ste
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Collection, Mapping
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from agent_client.actions import action_table
 from agent_client.errors import ContractMismatch, Difference, PolicyError
 from agent_client.features import FEATURE_NAMES
+from agent_client.history import LAG_MAX, PRESENT
 from agent_client.settings import DEFAULT_DT, Settings
 
 CONTRACT_VERSION: Final = 1
@@ -76,11 +78,14 @@ class Contract:
     dt: float
     """Control step (s)."""
     normalisation: Normalisation
+    """Of the stacked observation: one mean and one variance for each feature of each lag."""
     network: Network
     settings: Mapping[str, Mapping[str, Any]]
     """All settings by group and name, as in `agent_client.settings`; `COMPARED` says which must agree."""
     training: Mapping[str, Any] = field(default_factory=dict)
     """What the policy was trained with: preset, seed, steps, dynamics, versions. Recorded, never compared."""
+    lags: tuple[int, ...] = PRESENT
+    """Ages (control steps) of the observations that are stacked for the policy (`agent_client.history`)."""
     version: int = CONTRACT_VERSION
 
 
@@ -91,6 +96,7 @@ def running_contract(
     normalisation: Normalisation | None = None,
     network: Network | None = None,
     training: Mapping[str, Any] | None = None,
+    lags: tuple[int, ...] = PRESENT,
 ) -> Contract:
     """The contract of what runs (or of what is trained) under these settings and this control step (s)."""
     settings = settings or Settings()
@@ -103,10 +109,11 @@ def running_contract(
         masked=tuple(masked),
         actions=tuple(ActionEntry(*row) for row in rows),
         dt=dt,
-        normalisation=normalisation or Normalisation.identity(len(FEATURE_NAMES)),
+        normalisation=normalisation or Normalisation.identity(len(FEATURE_NAMES) * len(lags)),
         network=network or Network((), "tanh"),
         settings=tree,
         training=json.loads(json.dumps(training or {})),
+        lags=lags,
     )
 
 
@@ -183,8 +190,9 @@ def require_match(
 
 
 def mask_of(contract: Contract) -> NDArray[np.bool_]:
-    """Which features are masked, (F,)."""
-    return np.array([name in contract.masked for name in contract.observations], dtype=np.bool_)
+    """Which entries of the stacked observation are masked, (F L,)."""
+    masked = np.array([name in contract.masked for name in contract.observations], dtype=np.bool_)
+    return np.tile(masked, len(contract.lags))
 
 
 class _Absent:
@@ -218,15 +226,17 @@ def _from_tree(tree: dict[str, Any]) -> Contract:
         network=Network(tuple(int(n) for n in network["hidden"]), str(network["activation"])),
         settings={str(group): dict(values) for group, values in tree["settings"].items()},
         training=dict(tree.get("training", {})),
+        lags=tuple(int(lag) for lag in tree.get("lags", PRESENT)),
     )
 
 
 def _check_form(contract: Contract, name: str) -> None:
     """Refuse a contract that contradicts itself."""
-    features = len(contract.observations)
+    features = len(contract.observations) * len(contract.lags)
     norm, names = contract.normalisation, set(contract.observations)
     checks = (
         ("dt", "a number above 0", contract.dt, math.isfinite(contract.dt) and contract.dt > 0),
+        ("lags", f"0, then rising ages up to {LAG_MAX} steps", contract.lags, _rising(contract.lags)),
         ("normalisation.mean", f"{features} finite numbers", len(norm.mean), _finite(norm.mean, features)),
         ("normalisation.variance", f"{features} numbers, at least 0 with epsilon above 0", len(norm.variance),
          _finite(norm.variance, features) and all(v >= 0 and v + norm.epsilon > 0 for v in norm.variance)),
@@ -237,6 +247,10 @@ def _check_form(contract: Contract, name: str) -> None:
     for field_name, expected, found, right in checks:
         if not right:
             raise PolicyError(f"{name}: contract.json: {field_name}: expected {expected}, found {found}")
+
+
+def _rising(lags: tuple[int, ...]) -> bool:
+    return lags[:1] == (0,) and lags[-1] <= LAG_MAX and all(a < b for a, b in itertools.pairwise(lags))
 
 
 def _finite(values: tuple[float, ...], count: int) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Final, Protocol
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from agent_client.actions import action_table, decode
 from agent_client.errors import SettingsError
+from agent_client.history import PRESENT, ObservationHistory
 from agent_client.settings import Settings
 from agent_client.task import TaskStep
 from meshes.geometry import Geometry
@@ -46,22 +48,33 @@ class ActingPolicy(Protocol):
     """Whatever maps observations to actions."""
 
     def act(self, observations: Singles) -> Ints:
-        """Action indices (N,) for observations (N, 37)."""
+        """Action indices (N,) for observations (N, 37 L)."""
         ...
 
 
 class PolicyController(Controller):
-    """A policy over the 36 discrete actions; it sees the observation alone."""
+    """A policy over the 36 discrete actions; it sees the observation alone, the present one or some past ones.
 
-    def __init__(self, policy: ActingPolicy, settings: Settings) -> None:
+    Args:
+        policy: who decides.
+        settings: constants of the task.
+        lags: ages of the observations that the policy sees stacked (`agent_client.history`).
+    """
+
+    def __init__(self, policy: ActingPolicy, settings: Settings, lags: Sequence[int] = PRESENT) -> None:
         self.policy: Final = policy
+        self._lags = lags
+        self._history = ObservationHistory(1, lags)
         self._table = table = action_table(settings)
         # Loads compiled code before the first control step and not in it.
         decode(np.zeros(1, np.int64), np.eye(3)[None], table.local, table.speed, np.zeros((1, 8)))
 
     def act(self, step: TaskStep, commands: CommandBatch, actions: Ints) -> None:
         """Ask the policy, and turn its actions from the local frame into the world's."""
-        actions[:] = self.policy.act(step.observation)
+        if len(actions) != self._history.lanes:
+            self._history = ObservationHistory(len(actions), self._lags)
+        self._history.follow(step)
+        actions[:] = self.policy.act(self._history.stack())
         decode(actions, step.frame, self._table.local, self._table.speed, commands.raw)
 
 

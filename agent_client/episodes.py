@@ -56,7 +56,7 @@ def episode_dtype(rays: int) -> np.dtype[np.void]:
             ("quality", "f8"),
             ("min_clearance", "f8"),
             ("reward", "f8"),
-            ("reward_terms", "f8", (9,)),
+            ("reward_terms", "f8", (10,)),
             # Kept from step to step and shown to nobody: tube's length, arc length and velocity along f one
             # control step ago, velocity along f now, factor of the reward's per-step terms, sums for Q.
             ("length", "f8"),
@@ -106,6 +106,7 @@ def constants(settings: Settings, dt: float, *, clearance_contact: bool, on_cont
         "warmup_steps": s.reward.warmup_steps,
         # Length over which the per-step terms of the reward are paid; 0 for the literal reward.
         "reward_length": s.speed_max * dt if s.reward.per_metre else 0.0,
+        "reward_centring": s.reward.centring,
         "reward_success": s.reward.success,
         "reward_failure": s.reward.failure,
         "reward_timeout": s.reward.timeout,

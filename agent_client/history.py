@@ -11,11 +11,15 @@ from numpy.typing import NDArray
 
 from agent_client.conditions import DELAY_MAX
 from agent_client.features import FEATURES
+from agent_client.task import TaskStep
 
 Singles = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
-PRESENT: Final = (0,)
+LAG_MAX: Final = 1000
+"""Greatest lag (control steps)."""
+
+PRESENT: Final[tuple[int, ...]] = (0,)
 """Lags of a policy that sees the present alone: the paper's."""
 
 
@@ -29,6 +33,7 @@ class ObservationHistory:
     """
 
     def __init__(self, lanes: int, lags: Sequence[int] = PRESENT) -> None:
+        self.lanes: Final = lanes
         self._lags: Ints = np.array(lags, dtype=np.int64)
         self._ring: Singles = np.zeros((max(lags) + DELAY_MAX + 1, lanes, len(FEATURES)), np.float32)
         self._delay: Ints = np.zeros(lanes, dtype=np.int64)
@@ -50,6 +55,14 @@ class ObservationHistory:
         """Take in the observations (N, 37) of a control step."""
         self._head = (self._head + 1) % len(self._ring)
         self._ring[self._head] = observation
+
+    def follow(self, step: TaskStep) -> None:
+        """Take in a step of N episodes, each of which may have begun with it."""
+        fresh = step.step == 0
+        if not fresh.all():
+            self.push(step.observation)
+        if fresh.any():
+            self.begin(np.flatnonzero(fresh), step.observation, step.episodes["observation_delay"])
 
     def stack(self) -> Singles:
         """What the policy sees, (N, 37 L): the observation of each lag, in the order of the lags.

@@ -26,6 +26,7 @@ Floats32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 FEATURES: Final = 37
+"""Of one observation; a policy with a history sees several, stacked."""
 ACTIONS: Final = 36
 
 _ACTIVATIONS: Final = {"tanh": 0, "relu": 1}
@@ -75,13 +76,14 @@ class Policy:
         self._logits = np.zeros((1, ACTIONS), dtype=np.float32)
         self._actions = np.zeros(1, dtype=np.int64)
         # Loads compiled code now, which would else hold up the first control step by some ten milliseconds.
-        self.act(np.zeros((1, FEATURES), dtype=np.float32))
+        self.act(np.zeros((1, len(self._mean)), dtype=np.float32))
 
     def act(self, observations: Floats32) -> Ints:
         """Choose the most likely action of each lane, (N,); the lowest index among equals.
 
         Args:
-            observations: (N, 37) float32, as the task makes them: neither normalised nor masked.
+            observations: (N, 37 L) float32, as the task makes them, neither normalised nor masked: those of
+                the contract's L lags, stacked by `agent_client.history`.
 
         Returns:
             Action indices (N,), overwritten by the next call.
@@ -151,9 +153,10 @@ def _check_spaces(contract: Contract, layers: Sequence[Layer], name: str) -> Non
     if not layers:
         raise PolicyError(f"{name}: expected an actor of at least one layer, found none")
     inputs, outputs = layers[0].weight.shape[0], layers[-1].weight.shape[1]
-    if (inputs, outputs) != (FEATURES, ACTIONS):
+    expected = FEATURES * len(contract.lags)
+    if (inputs, outputs) != (expected, ACTIONS):
         raise PolicyError(
-            f"{name}: expected observation space Box({FEATURES},) and action space Discrete({ACTIONS}), "
+            f"{name}: expected observation space Box({expected},) and action space Discrete({ACTIONS}), "
             f"found Box({inputs},) and Discrete({outputs})"
         )
     if (len(contract.observations), len(contract.actions)) != (FEATURES, ACTIONS):

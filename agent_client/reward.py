@@ -27,6 +27,7 @@ TERMS: Final = (
     "vertical",  # 0.3 (1 - |v_f|); regime 2
     "imbalance",  # -0.3 |S_F - S_R|; regime 3
     "warmup",
+    "centring",  # a weight times S_center; our addition, 0 unless set
     "terminal",
 )
 """Names of the reward's terms, in the order of the columns of `reward_terms`."""
@@ -96,12 +97,14 @@ def score(lanes: Ints, episodes: Records, constants: Records) -> None:
         if e.step <= constant.warmup_steps:
             symmetry = (0.7 * e.S_F + 0.3 * e.S_R) * (1.0 - imbalance)
             terms[7] = g * 0.5 * symmetry * (1.0 - 0.5 * e.C_turn)
+        # Never paid by more than v_max dt of progress, which a cut corner would exceed.
+        terms[8] = min(g, 1.0) * constant.reward_centring * e.centring
         if e.outcome == 1:
-            terms[8] = constant.reward_success
+            terms[9] = constant.reward_success
         elif e.outcome == 2 or e.outcome == 3:
-            terms[8] = constant.reward_failure
+            terms[9] = constant.reward_failure
         elif e.outcome == 4:
-            terms[8] = constant.reward_timeout
+            terms[9] = constant.reward_timeout
         total = 0.0
         for t in range(terms.shape[0]):
             total += terms[t]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 import torch
@@ -19,6 +20,63 @@ from agent_client.errors import PolicyError
 from agent_client.policy import ACTIONS, FEATURES, Policy
 
 ACTIVATIONS: Final[dict[str, type[torch.nn.Module]]] = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}
+
+
+class AsymmetricExtractor(torch.nn.Module):
+    """Two towers: the policy's sees the first entries of the observation, the value's sees all of them.
+
+    Args:
+        width: entries of the whole observation.
+        seen: entries that the policy sees.
+        hidden: layers of either tower.
+        activation: between them.
+    """
+
+    def __init__(
+        self, width: int, seen: int, hidden: Sequence[int], activation: type[torch.nn.Module]
+    ) -> None:
+        super().__init__()
+        self._seen = seen
+        self.policy_net = _tower(seen, hidden, activation)
+        self.value_net = _tower(width, hidden, activation)
+        self.latent_dim_pi = self.latent_dim_vf = hidden[-1]
+
+    def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Latent codes of policy and value."""
+        return self.forward_actor(features), self.forward_critic(features)
+
+    def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
+        """Latent code of the policy."""
+        return cast(torch.Tensor, self.policy_net(features[:, : self._seen]))
+
+    def forward_critic(self, features: torch.Tensor) -> torch.Tensor:
+        """Latent code of the value."""
+        return cast(torch.Tensor, self.value_net(features))
+
+
+def _tower(inputs: int, hidden: Sequence[int], activation: type[torch.nn.Module]) -> torch.nn.Sequential:
+    modules: list[torch.nn.Module] = []
+    for outputs in hidden:
+        modules += [torch.nn.Linear(inputs, outputs), activation()]
+        inputs = outputs
+    return torch.nn.Sequential(*modules)
+
+
+class AsymmetricPolicy(ActorCriticPolicy):
+    """An actor-critic policy whose value network sees more than the policy (`agent_client.privileged`).
+
+    Args:
+        seen: entries of the observation that the policy sees, the first ones.
+        others: as for stable-baselines3's own.
+    """
+
+    def __init__(self, *arguments: Any, seen: int, **others: Any) -> None:
+        self._seen = seen
+        super().__init__(*arguments, **others)
+
+    def _build_mlp_extractor(self) -> None:
+        hidden = self.net_arch["pi"]
+        self.mlp_extractor = AsymmetricExtractor(self.features_dim, self._seen, hidden, self.activation_fn)
 
 
 def load_plain(path: Path) -> Policy:

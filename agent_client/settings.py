@@ -117,6 +117,9 @@ class RewardSettings:
     literal reward (False) pays for time in the tube and so teaches loitering."""
     warmup_steps: int = 10
     """t_warmup: control steps with the warm-up bonus. Our choice: the first second."""
+    centring: float = 0.0
+    """Weight of S_center in the per-step terms. Our addition: the paper judges by S_traj = (S_center + S_align) / 2
+    but rewards S_align alone, so that a policy that cuts corners loses 2 % of its reward."""
     success: float = 10.0
     failure: float = -10.0
     """For leaving the tube and for collision alike."""
@@ -200,6 +203,7 @@ def _rules(s: Settings) -> tuple[tuple[str, object, str, bool], ...]:
         ("task.success_radius", s.task.success_radius, "above 0", s.task.success_radius > 0.0),
         ("task.time_factor", s.task.time_factor, "above 0", s.task.time_factor > 0.0),
         ("task.safety_scale", s.task.safety_scale, "above 0 m", s.task.safety_scale > 0.0),
+        ("reward.centring", s.reward.centring, "at least 0", s.reward.centring >= 0.0),
         ("reward.warmup_steps", s.reward.warmup_steps, "at least 0", s.reward.warmup_steps >= 0),
     )
 

@@ -28,10 +28,12 @@ from agent_client.checkpoint import write_checkpoint
 from agent_client.contract import Normalisation, running_contract
 from agent_client.curriculum import Curriculum
 from agent_client.environment import TubeVecEnv
+from agent_client.features import FEATURES
 from agent_client.kinematic import KinematicPlant
-from agent_client.sb3_policy import ACTIVATIONS, actor_of
-from agent_client.settings import DEFAULT_DT, Settings
+from agent_client.sb3_policy import ACTIVATIONS, AsymmetricPolicy, actor_of
+from agent_client.settings import DEFAULT_DT, RewardSettings, Settings
 from agent_client.tubes import LEVELS, PAPER_TUBES, POOL_SIZE, VARIED_TUBES, TubeRecipe, draw_pool
+from agent_client.world import TubeWorld, WorldOptions
 from protocol.agent import AgentSession, SessionSettings
 from protocol.twin import open_twin
 
@@ -78,16 +80,18 @@ class TrainingOptions:
     seed: int = 0
     preset: str = "custom"
     """Name for the contract."""
-    settings: Settings = field(default_factory=Settings)
+    world: WorldOptions = field(default_factory=WorldOptions)
+    """Settings, conditions, and what policy and value network see."""
     dt: float = DEFAULT_DT
+    physics_dt: float = DEFAULT_DT
+    """Inner step (s); the kinematic world has none and takes dt."""
     hyperparameters: Hyperparameters = field(default_factory=Hyperparameters)
-    tubes: TubeRecipe = PAPER_TUBES
+    tubes: tuple[TubeRecipe, ...] = (PAPER_TUBES,)
+    """Recipes that the tubes of a pool are drawn from in turn."""
     pool: int = POOL_SIZE
     """Tubes of each level, drawn from training's domain before the first step."""
     replay: float = 0.0
     """Share of episodes from earlier levels (`agent_client.curriculum`)."""
-    centring: float = 0.0
-    """Weight of S_center in the reward while training; 0 is the paper's (`agent_client.environment`)."""
     threads: int = 1
     """Torch's threads. The policy's bits depend on it."""
     save_every: int = 10
@@ -127,10 +131,11 @@ def shipped_options(out: Path, steps: int = 2_000_000, seed: int = 1) -> Trainin
         seed=seed,
         preset="shipped",
         hyperparameters=Hyperparameters(final_learning_rate=3e-5),
-        settings=Settings(masked_features=UNKNOWN_TUBE),
-        tubes=VARIED_TUBES,
+        world=WorldOptions(
+            replace(Settings(masked_features=UNKNOWN_TUBE), reward=RewardSettings(centring=3.0))
+        ),
+        tubes=(VARIED_TUBES,),
         replay=0.3,
-        centring=3.0,
     )
 
 
@@ -154,14 +159,14 @@ def train(
     hyper = options.hyperparameters
     hyper = replace(hyper, minibatch=fitting_minibatch(hyper))
     options = replace(options, hyperparameters=hyper)  # so that the contract records what was trained with
-    session_settings = SessionSettings(lanes=hyper.lanes, dt=options.dt, physics_dt=options.dt)
-    opener = open_session or (lambda s: open_twin(KinematicPlant(options.settings), s))
+    session_settings = SessionSettings(lanes=hyper.lanes, dt=options.dt, physics_dt=options.physics_dt)
+    opener = open_session or (lambda s: open_twin(KinematicPlant(options.world.settings), s))
     pools = [draw_pool(level, options.seed, options.pool, options.tubes) for level in range(LEVELS)]
     curriculum = Curriculum(replay=options.replay)
     with opener(session_settings) as session:
-        tubes = TubeVecEnv(session, pools, curriculum, options.settings, options.seed, options.centring)
+        world = TubeWorld(session, pools, curriculum, options.world, options.seed)
         env = VecNormalize(
-            tubes,
+            TubeVecEnv(world),
             norm_reward=False,
             clip_obs=hyper.observation_clip,
             gamma=hyper.gamma,
@@ -189,8 +194,9 @@ def _make_model(env: VecNormalize, options: TrainingOptions) -> PPO:
     hyper = options.hyperparameters
     first, last = hyper.learning_rate, hyper.final_learning_rate
     layers = list(hyper.hidden)
+    seen = len(options.world.lags) * len(FEATURES)
     model = PPO(
-        "MlpPolicy",
+        AsymmetricPolicy if options.world.privileged else "MlpPolicy",
         env,
         learning_rate=first if first == last else _LinearRate(first, last),
         n_steps=hyper.rollout,
@@ -203,6 +209,7 @@ def _make_model(env: VecNormalize, options: TrainingOptions) -> PPO:
         policy_kwargs={
             "net_arch": {"pi": layers, "vf": layers},
             "activation_fn": ACTIVATIONS[hyper.activation],
+            **({"seen": seen} if options.world.privileged else {}),
         },
         tensorboard_log=str(options.tensorboard) if options.tensorboard else None,
         seed=options.seed,
@@ -297,11 +304,15 @@ class _Watcher(BaseCallback):
         """Write the checkpoint with the contract as it stands."""
         options, hyper, seen = self._options, self._options.hyperparameters, self._env.obs_rms
         layers, network = actor_of(self.model.policy, str(options.out))
+        width = len(options.world.lags) * len(FEATURES)  # of what the policy sees
         contract = running_contract(
-            options.settings,
+            options.world.settings,
             options.dt,
             normalisation=Normalisation(
-                tuple(seen.mean.tolist()), tuple(seen.var.tolist()), hyper.observation_clip, hyper.epsilon
+                tuple(seen.mean[:width].tolist()),
+                tuple(seen.var[:width].tolist()),
+                hyper.observation_clip,
+                hyper.epsilon,
             ),
             network=network,
             training={
@@ -311,8 +322,9 @@ class _Watcher(BaseCallback):
                 "dynamics": self._engine,
                 "level": self._curriculum.level,
                 "replay": options.replay,
-                "centring": options.centring,
-                "tubes": asdict(options.tubes),
+                "conditions": asdict(options.world.conditions),
+                "privileged": options.world.privileged,
+                "tubes": [asdict(recipe) for recipe in options.tubes],
                 "hyperparameters": asdict(hyper),
                 "versions": {
                     "python": platform.python_version(),
@@ -321,6 +333,7 @@ class _Watcher(BaseCallback):
                     "numpy": np.__version__,
                 },
             },
+            lags=options.world.lags,
         )
         buffer = io.BytesIO()
         self.model.save(buffer, exclude=_NOT_THE_POLICY)

@@ -14,7 +14,15 @@ import numpy as np
 
 from agent_client.conditions import Condition, Range
 from agent_client.errors import SettingsError
-from meshes.curves import CURVATURE_CAP, DOMAINS, HARD_CURVATURE_CAP, Curve, generate_curve
+from meshes.curves import (
+    CURRICULUM,
+    CURVATURE_CAP,
+    DOMAINS,
+    HARD_CURVATURE_CAP,
+    SHAPES,
+    Curve,
+    generate_curve,
+)
 from meshes.geometry import Floats
 from meshes.swept import SweptTube, sweep_section
 
@@ -37,6 +45,12 @@ TUBE_SETTINGS: Final = (
 )
 """The settings of a recipe that are numbers, in the order of the fields of `TubeRecipe`, which has their
 defaults."""
+
+MIXED: Final = "mixed"
+"""Instead of a shape: each tube has one of them, as likely as any other."""
+
+TUBE_SHAPES: Final = (*SHAPES, MIXED)
+"""The values of the setting `shape`."""
 
 WIDEST_FOLD: Final = 0.95
 """Greatest product of curvature and wall distance; at 1 the wall folds inside of the bend."""
@@ -61,14 +75,17 @@ class TubeRecipe:
     swing: Range = (0.0, 0.0)
     """Largest relative change of the radius along the tube, a gentle wave."""
     curvature_cap: float = CURVATURE_CAP
-    """Greatest curvature (1/R) at level 2; levels 0 and 1 keep the paper's own curves. A tube whose widest wall
-    would fold in its bends is drawn with bends as wide as its wall needs (`WIDEST_FOLD`)."""
+    """Greatest curvature (1/R) at level 2, and of the named shapes. The curriculum's levels 0 and 1 keep the
+    paper's own curves. A tube whose widest wall would fold in its bends is drawn with wider bends, as wide as
+    `WIDEST_FOLD` asks for."""
     ellipse: Range = (0.0, 0.0)
     """Amplitude over R of the section's second harmonic, at an angle of its own, the same all along."""
     lobes: Range = (0.0, 0.0)
     """Amplitude over R of one higher harmonic, at an angle of its own, the same all along."""
     lobe_count: tuple[int, int] = (3, 5)
     """Order of that harmonic: the number of lobes."""
+    shape: str = CURRICULUM
+    """Shape of the axis, one of `TUBE_SHAPES`: the paper's families, a named shape, or any of them."""
 
     def __post_init__(self) -> None:
         for row in TUBE_SETTINGS:
@@ -81,6 +98,8 @@ class TubeRecipe:
                     f"{row.name}: expected {kind} {'low <= high ' if span else ''}within {row.lowest:g} to "
                     f"{row.highest:g} {row.unit}, found {value}"
                 )
+        if self.shape not in TUBE_SHAPES:
+            raise SettingsError(f"shape: expected one of {', '.join(TUBE_SHAPES)}, found {self.shape!r}")
 
 
 def _allowed(row: Condition, values: tuple[float, ...]) -> bool:
@@ -116,12 +135,17 @@ def draw_tube(level: int, seed: Sequence[int], domain: Domain, recipe: TubeRecip
     wavelength, turn = rng.uniform(8.0, 20.0), rng.uniform()
     swing = rng.uniform(*recipe.swing)
     harmonics = _draw_section(rng, recipe)
+    shape = SHAPES[math.floor(rng.random() * len(SHAPES))] if recipe.shape == MIXED else recipe.shape
 
-    def draw_curve(curvature_cap: float) -> Curve:
-        return generate_curve(level, seed, length, domain=domain, curvature_cap=curvature_cap)
-
-    curve = draw_curve(recipe.curvature_cap if level == LEVELS - 1 else CURVATURE_CAP)
     widest = (1.0 + swing) * (1.0 + float(np.hypot(*harmonics.T).sum()))
+
+    def draw_curve(cap: float) -> Curve:
+        return generate_curve(
+            level, seed, length, domain=domain, curvature_cap=cap, shape=shape, widest=widest
+        )
+
+    easy = shape == CURRICULUM and level < LEVELS - 1
+    curve = draw_curve(CURVATURE_CAP if easy else recipe.curvature_cap)
     if curve.curvature.max(initial=0.0) * widest > WIDEST_FOLD:
         curve = draw_curve(WIDEST_FOLD / widest)
     phase = 2.0 * np.pi * (curve.step * np.arange(len(curve.points)) / wavelength + turn)
@@ -151,7 +175,7 @@ def _harmonic(span: Range, share: float, turn: float) -> tuple[float, float]:
 
 
 def draw_pool(
-    level: int, seed: int, count: int = POOL_SIZE, recipe: TubeRecipe = PAPER_TUBES
+    level: int, seed: int, count: int = POOL_SIZE, recipes: Sequence[TubeRecipe] = (PAPER_TUBES,)
 ) -> list[SweptTube]:
-    """Draw `count` tubes of a level from training's domain."""
-    return [draw_tube(level, (seed, index), "train", recipe) for index in range(count)]
+    """Draw `count` tubes of a level from training's domain, from the recipes in turn."""
+    return [draw_tube(level, (seed, i), "train", recipes[i % len(recipes)]) for i in range(count)]

@@ -152,7 +152,7 @@ def read_pilot(
         "training": dict(contract.training),
         "mismatch": [asdict(difference) for difference in mismatch],
     }
-    return Pilot(PolicyController(policy, settings), settings, dt, description, (*policy.notes, *notes))
+    return Pilot(PolicyController(policy, settings, contract.lags), settings, dt, description, (*policy.notes, *notes))
 
 
 def parse_parameters(pairs: tuple[str, ...]) -> dict[str, float]:

@@ -23,7 +23,7 @@ SHORT = TubeRecipe(lengths=(4.0,))
 
 def make_pools(count: int = 4) -> list:
     """A small pool of short tubes for each level."""
-    return [draw_pool(level, 0, count, SHORT) for level in range(3)]
+    return [draw_pool(level, 0, count, (SHORT,)) for level in range(3)]
 
 
 @pytest.fixture
