@@ -36,9 +36,9 @@ Domain: TypeAlias = Literal["train", "tune", "evaluate"]
 
 TUBE_SETTINGS: Final = (
     Condition("lengths", "R", "lengths of the axis, one of which is drawn", 1.0, 2000.0),
-    Condition("curvature_cap", "1/R", "greatest curvature; 0.9 is a bend radius of 1.1 R", 0.05, 0.9),
     Condition("radius", "m", "mean radius R; the whole tube is scaled by it", 0.5, 2.0),
     Condition("swing", "R", "greatest change of the radius along the tube, a gentle wave", 0.0, 0.3),
+    Condition("curvature_cap", "1/R", "greatest curvature; 0.9 is a bend radius of 1.1 R", 0.05, 0.9),
     Condition("ellipse", "R", "amplitude of an elliptic section", 0.0, 0.3),
     Condition("lobes", "R", "amplitude of a lobed section", 0.0, 0.2),
     Condition("lobe_count", "lobes", "number of lobes of a lobed section", 3, 8, whole=True),
@@ -136,7 +136,6 @@ def draw_tube(level: int, seed: Sequence[int], domain: Domain, recipe: TubeRecip
     swing = rng.uniform(*recipe.swing)
     harmonics = _draw_section(rng, recipe)
     shape = SHAPES[math.floor(rng.random() * len(SHAPES))] if recipe.shape == MIXED else recipe.shape
-
     widest = (1.0 + swing) * (1.0 + float(np.hypot(*harmonics.T).sum()))
 
     def draw_curve(cap: float) -> Curve:

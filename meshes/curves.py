@@ -5,10 +5,10 @@ curved, two for each level, reparameterised by B-splines of random degree and te
 alpha in [0.1, 0.9]. It gives no formulas. Those below are our choice: each family advances along x and swings
 in y and z, its swing set by the curvature at its crests and its wavelength, in ranges that give the medians
 0.13, 0.37, 0.58 per R of the maximum curvature and 72, 211, 365 degrees of total turning at the levels 0, 1
-and 2, within 10 %.
+and 2, within 10 %. `meshes.shapes` has other shapes than the paper's.
 
-Curves are made at R = 1 m in pieces of 20 m. A longer one is a chain of pieces, so that a level means the
-same at every length; a piece that comes too near to an earlier one is drawn anew.
+Curves are made at R = 1 m in pieces, the paper's of 20 m. A longer one is a chain of pieces, so that a level
+means the same at every length; a piece that comes too near to an earlier one is drawn anew.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ import numpy as np
 from meshes.compiled import compiled
 from meshes.errors import CurveError
 from meshes.geometry import Floats
+from meshes.shapes import NAMED_SHAPES
 
 STEP = 0.2
 """Arc length between two points of a curve (m)."""
 PIECE_LENGTH = 20.0
-"""Arc length that is drawn at once (m): the length of the paper's tubes as we take it, 20 R."""
+"""Arc length of a piece (m): the length of the paper's tubes as we take it, 20 R."""
 CURVATURE_CAP = 0.65
 """Greatest curvature of a curve (1/R)."""
 HARD_CURVATURE_CAP = 0.9
@@ -35,6 +36,8 @@ SELF_DISTANCE = 2.3
 """Least distance between parts of one curve (R): two walls and a gap of 0.3 R."""
 SELF_ARC = 4.5
 """Arc length between points (R) from which on SELF_DISTANCE holds."""
+WIDEST = SELF_DISTANCE / 2.0
+"""Greatest wall distance (R) that SELF_DISTANCE has room for; walls beyond it need more in proportion."""
 
 FUSION = (0.1, 0.9)
 """Range of alpha, the weight of a level's first family."""
@@ -61,6 +64,11 @@ HELIX_DRIFT = 0.3
 """Change of the helix's wavenumber along a raw curve, over its mean."""
 HELIX_FLATNESS = (0.5, 1.0)
 """Ratio of the helix's two amplitudes."""
+
+CURRICULUM = "curriculum"
+"""The shape that a curve has by default: the paper's families at their levels."""
+SHAPES = (CURRICULUM, *NAMED_SHAPES)
+"""Shapes that a curve may have."""
 
 DOMAINS = {"train": 1, "tune": 2, "evaluate": 3}
 """Tags of the seed domains: tubes of one domain are never drawn in another."""
@@ -154,6 +162,8 @@ def generate_curve(
     *,
     domain: str = "train",
     curvature_cap: float = CURVATURE_CAP,
+    shape: str = CURRICULUM,
+    widest: float = 1.0,
 ) -> Curve:
     """Draws the curve that belongs to a level and a seed; the same arguments give the same curve.
 
@@ -162,20 +172,21 @@ def generate_curve(
         seed: whole numbers from 0 to 2**64 - 1.
         length: arc length (m), at least 1; the step is the nearest to 0.2 m that divides it.
         domain: "train", "tune" or "evaluate"; tubes of different domains have nothing in common.
-        curvature_cap: greatest curvature (1/m), up to 0.9 for hard tubes: the same shapes, made smaller by
-            the cap over 0.65, so that they bend more tightly and more often.
+        curvature_cap: greatest curvature (1/m), up to 0.9 for hard tubes: the same curves, made smaller by
+            the cap over 0.65, so that they bend more tightly and more often. Named shapes reach it at level 2.
+        shape: "curriculum", or the name of one of `meshes.shapes`.
+        widest: greatest distance of the wall from the axis over R. Beyond 1.15, parts of the curve keep 2
+            `widest` R apart in place of 2.3 R.
 
     Raises:
         CurveError: an argument out of range, or no curve that keeps clear of itself was found.
     """
-    if not (np.isfinite(length) and length >= 1.0):
-        raise CurveError(f"length: expected at least 1 m but found {length}")
-    if not 0.0 < curvature_cap <= HARD_CURVATURE_CAP:
-        raise CurveError(f"curvature_cap: expected 0 to {HARD_CURVATURE_CAP} per m but found {curvature_cap}")
+    _check_arguments(length, curvature_cap, shape)
+    draw_piece = NAMED_SHAPES.get(shape, _draw_fused)
     rng = np.random.Generator(np.random.PCG64(_seed_sequence(level, seed, domain)))
     segments = round(length / STEP)
     step = length / segments
-    piece_segments = round(PIECE_LENGTH / step)
+    room = max(widest / WIDEST, 1.0)
     points = np.zeros((segments + 1, 3))
     ends = [1]  # how many points stand after each piece
     draws = retreats = 0
@@ -185,16 +196,18 @@ def generate_curve(
             del ends[max(len(ends) - RETREAT, 1) :]
         if retreats > MAX_RETREATS:
             raise CurveError(
-                f"level {level}, seed {tuple(seed)}, length {length:g} m: expected a curve with curvature up "
-                f"to {curvature_cap:g} per m that keeps clear of itself but found none; use another seed"
+                f"shape {shape}, level {level}, seed {tuple(seed)}, length {length:g} m: expected a curve with "
+                f"curvature up to {curvature_cap:g} per m that keeps clear of itself but found none; use "
+                "another seed"
             )
         draws += 1
-        start, stop = ends[-1], min(ends[-1] + piece_segments, segments + 1)
-        piece = _draw_piece(rng, LEVELS[level], stop - start, step, curvature_cap)
+        start = ends[-1]
+        piece = draw_piece(rng, level, segments + 1 - start, step, curvature_cap)
         if piece is None:
             continue
+        stop = start + len(piece) - 2
         points[start:stop] = _continue(rng, points[:start], piece)
-        if _self_approach(points[:stop], start, int(SELF_ARC / step), SELF_DISTANCE, step) < 0:
+        if _self_approach(points[:stop], start, int(SELF_ARC * room / step), SELF_DISTANCE * room, step) < 0:
             ends.append(stop)
             draws = 0
     return Curve(points, step)
@@ -223,6 +236,15 @@ def check_curve(curve: Curve, curvature_cap: float = CURVATURE_CAP, radius: floa
         )
 
 
+def _check_arguments(length: float, curvature_cap: float, shape: str) -> None:
+    if not (np.isfinite(length) and length >= 1.0):
+        raise CurveError(f"length: expected at least 1 m but found {length}")
+    if not 0.0 < curvature_cap <= HARD_CURVATURE_CAP:
+        raise CurveError(f"curvature_cap: expected 0 to {HARD_CURVATURE_CAP} per m but found {curvature_cap}")
+    if shape not in SHAPES:
+        raise CurveError(f"shape: expected one of {', '.join(SHAPES)} but found {shape!r}")
+
+
 def _seed_sequence(level: int, seed: Sequence[int], domain: str) -> np.random.SeedSequence:
     if level not in range(len(LEVELS)):
         raise CurveError(f"level: expected 0, 1 or 2 but found {level}")
@@ -236,16 +258,13 @@ def _seed_sequence(level: int, seed: Sequence[int], domain: str) -> np.random.Se
     return np.random.SeedSequence([DOMAINS[domain], level, len(seed), *words])
 
 
-def _draw_piece(
-    rng: np.random.Generator,
-    families: tuple[Family, Family],
-    segments: int,
-    step: float,
-    curvature_cap: float,
+def _draw_fused(
+    rng: np.random.Generator, level: int, segments: int, step: float, curvature_cap: float
 ) -> Floats | None:
-    """One fused curve (segments + 2, 3), of which the first chord is the heading; None if it is too tight."""
+    """A piece of a level's two families, fused, as a `meshes.shapes.DrawPiece`; None if it is too tight."""
+    segments = min(segments, round(PIECE_LENGTH / step))
     scale = CURVATURE_CAP / curvature_cap
-    raw = [_smooth(rng, family) for family in families]
+    raw = [_smooth(rng, family) for family in LEVELS[level]]
     alpha = rng.uniform(*FUSION)
     fused = scale * (alpha * raw[0] + (1.0 - alpha) * raw[1])
     reached = arc_lengths(fused)

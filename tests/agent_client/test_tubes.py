@@ -80,7 +80,7 @@ def test_the_same_arguments_give_the_same_tube() -> None:
             np.testing.assert_array_equal(getattr(one, name), getattr(again, name))
         ends = [draw_tube(1, (5,), domain, recipe).points[-1] for domain in ("train", "tune", "evaluate")]
         assert min(np.linalg.norm(ends[a] - ends[b]) for a, b in ((0, 1), (0, 2), (1, 2))) > 1e-3
-    pool = draw_pool(1, 5, 2, EVERYTHING)
+    pool = draw_pool(1, 5, 2, (EVERYTHING,))
     np.testing.assert_array_equal(pool[1].points, draw_tube(1, (5, 1), "train", EVERYTHING).points)
 
 
@@ -88,7 +88,7 @@ def test_radii_fill_their_range() -> None:
     """The mean radius is drawn from its range; the tube is scaled by it, so that bends are the same over R."""
     tubes = tubes_of(TubeRecipe(radius=(0.6, 1.6)))
     radii = np.array([tube.radius[0] for tube in tubes])
-    assert 0.6 <= radii.min() < 0.7
+    assert 0.6 <= radii.min() < 0.75
     assert 1.5 < radii.max() <= 1.6
     for tube, plain in zip(tubes, tubes_of(PAPER_TUBES), strict=True):
         np.testing.assert_allclose(tube.points, plain.points * tube.radius[0], atol=1e-12)
