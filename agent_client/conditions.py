@@ -39,6 +39,21 @@ class Condition:
     needs_inertia: bool = False
     """Whether it has a meaning under rigid-body dynamics alone."""
 
+    def check(self, low: float, high: float) -> None:
+        """Refuse a range that this setting may not have; one value is a range of no width.
+
+        Raises:
+            SettingsError: it is out of bounds or upside down.
+        """
+        fits = self.lowest <= low <= high <= self.highest
+        if not fits or (self.whole and not (float(low).is_integer() and float(high).is_integer())):
+            kind = "whole numbers" if self.whole else "numbers"
+            found = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+            raise SettingsError(
+                f"{self.name}: expected {kind} low <= high within {self.lowest:g} to {self.highest:g} "
+                f"{self.unit}, found {found}"
+            )
+
 
 CONDITIONS: Final = (
     Condition("body_radius", "m", "radius of the drone's body", 0.01, 1.0),
@@ -105,14 +120,7 @@ class Conditions:
 
     def __post_init__(self) -> None:
         for name, (low, high) in self.ranges().items():
-            row = _BY_NAME[name]
-            fits = row.lowest <= low <= high <= row.highest
-            if not fits or (row.whole and not (float(low).is_integer() and float(high).is_integer())):
-                kind = "whole numbers" if row.whole else "numbers"
-                raise SettingsError(
-                    f"{name}: expected {kind} low <= high within {row.lowest:g} to {row.highest:g} {row.unit}, "
-                    f"found {low:g} to {high:g}"
-                )
+            _BY_NAME[name].check(low, high)
 
     def ranges(self) -> dict[str, Range]:
         """The range of each condition, by name."""

@@ -88,23 +88,16 @@ class TubeRecipe:
     """Shape of the axis, one of `TUBE_SHAPES`: the paper's families, a named shape, or any of them."""
 
     def __post_init__(self) -> None:
+        if not self.lengths:
+            raise SettingsError("lengths: expected at least one length over R, found none")
         for row in TUBE_SETTINGS:
             value = getattr(self, row.name)
-            values = value if isinstance(value, tuple) else (value,)
-            span = row.name not in ("lengths", "curvature_cap")
-            if not _allowed(row, values) or (span and not (len(values) == 2 and values[0] <= values[1])):
-                kind = "whole numbers" if row.whole else "numbers"
-                raise SettingsError(
-                    f"{row.name}: expected {kind} {'low <= high ' if span else ''}within {row.lowest:g} to "
-                    f"{row.highest:g} {row.unit}, found {value}"
-                )
+            # `lengths` are choices and the cap is one number; the rest are ranges.
+            choices = value if row.name == "lengths" else (value,)
+            for choice in choices:
+                row.check(*(choice if isinstance(choice, tuple) else (choice, choice)))
         if self.shape not in TUBE_SHAPES:
             raise SettingsError(f"shape: expected one of {', '.join(TUBE_SHAPES)}, found {self.shape!r}")
-
-
-def _allowed(row: Condition, values: tuple[float, ...]) -> bool:
-    whole = not row.whole or all(float(value).is_integer() for value in values)
-    return bool(values) and whole and all(row.lowest <= value <= row.highest for value in values)
 
 
 PAPER_TUBES: Final = TubeRecipe()

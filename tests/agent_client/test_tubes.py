@@ -165,17 +165,21 @@ def test_mixed_tubes_have_every_shape() -> None:
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ({"lengths": ()}, r"lengths: expected numbers within 1 to 2000 R, found \(\)"),
-        ({"lengths": (0.5,)}, r"lengths: .*found \(0\.5,\)"),
-        ({"curvature_cap": 0.95}, r"curvature_cap: expected numbers within 0\.05 to 0\.9 1/R, found"),
+        ({"lengths": ()}, "lengths: expected at least one length over R, found none"),
+        ({"lengths": (20.0, float("nan"))}, "lengths: expected"),
+        ({"lengths": (20.0, 0.5)}, r"lengths: expected numbers .* within 1 to 2000 R, found 0\.5"),
+        (
+            {"curvature_cap": 0.95},
+            r"curvature_cap: expected numbers .* within 0\.05 to 0\.9 1/R, found 0\.95",
+        ),
         (
             {"radius": (1.2, 0.8)},
-            r"radius: expected numbers low <= high within 0\.5 to 2 m, found \(1\.2, 0\.8\)",
+            r"radius: expected numbers low <= high within 0\.5 to 2 m, found 1\.2 to 0\.8",
         ),
         ({"radius": (0.8, float("nan"))}, "radius: expected"),
         ({"swing": (0.0, 0.4)}, "swing: expected"),
         ({"ellipse": (-0.1, 0.1)}, "ellipse: expected"),
-        ({"lobes": (0.1,)}, "lobes: expected"),
+        ({"lobes": (0.0, 0.25)}, "lobes: expected"),
         ({"lobe_count": (3, 4.5)}, "lobe_count: expected whole numbers low <= high within 3 to 8"),
         ({"shape": "knot"}, "shape: expected one of curriculum, helix, s-bend, elbow, mixed, found 'knot'"),
     ],
