@@ -1,20 +1,63 @@
-"""How a controller does over many tubes, one lane a tube."""
+"""How a controller does over many episodes, each of which one seed names and can be flown again alone."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
+from agent_client.conditions import Conditions, draw_conditions
 from agent_client.controllers import Controller
-from agent_client.flight import FlightResult, fly
+from agent_client.flight import fly
 from agent_client.settings import Settings
 from agent_client.task import Outcome
-from meshes.geometry import Floats, Geometry
+from agent_client.tubes import PAPER_TUBES, Domain, TubeRecipe, draw_tube
+from meshes.geometry import Geometry
 from meshes.swept import SweptTube
 from meshes.swept_geometry import SweptGeometry
 from protocol.agent import AgentSession
+from protocol.plant import NO_TUBE
+
+MakeController = Callable[[Geometry], Controller]
+"""Makes who flies, given the tubes."""
+
+RegisterWalls = Callable[[AgentSession, Sequence[SweptTube]], Sequence[int]]
+"""Makes the walls of tubes known to the plant of a session; returns the index of each."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode: the seed gives the tube, the start, the conditions and the noise of the sensors."""
+
+    level: int
+    seed: int
+    recipe: TubeRecipe = PAPER_TUBES
+    domain: Domain = "evaluate"
+
+    def tube(self) -> SweptTube:
+        """The episode's tube."""
+        return draw_tube(self.level, (self.seed,), self.domain, self.recipe)
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """How an episode ended."""
+
+    level: int
+    seed: int
+    outcome: Outcome
+    steps: int
+    progress: float
+    quality: float
+    min_clearance: float
+    """Smallest distance of the centre to the wall (m)."""
+    contacts: int
+    """Control steps with contact."""
+    length_ratio: float
+    """Steps over length / (v_max dt), the fewest possible."""
 
 
 @dataclass(frozen=True)
@@ -31,59 +74,110 @@ class Score:
     mean_steps: float
     """Mean length of an episode (control steps)."""
     length_ratio: float
-    """Mean over the successes of steps over length / (v_max dt), the fewest possible; NaN without a success."""
+    """Mean over the successes; NaN without a success."""
+    success_ci95: tuple[float, float]
+    """Wilson's interval of the success rate."""
 
 
-def evaluate(
+def draw_episodes(
+    level: int, count: int, seed: int, recipe: TubeRecipe = PAPER_TUBES, domain: Domain = "evaluate"
+) -> list[Episode]:
+    """The episodes of a level that belong to a seed; the first of many are the same as those of few.
+
+    Args:
+        level: 0, 1 or 2.
+        count: how many.
+        seed: a whole number from 0 on; any is unseen in training, which draws from a domain of its own.
+        recipe: of their tubes.
+        domain: of the tubes' seeds.
+    """
+    seeds = np.random.SeedSequence([seed, level]).generate_state(count, np.uint32).tolist()
+    return [Episode(level, number, recipe, domain) for number in seeds]
+
+
+def fly_episodes(
     session: AgentSession,
-    tubes: Sequence[SweptTube],
-    make_controller: Callable[[Geometry], Controller],
+    episodes: Sequence[Episode],
+    make_controller: MakeController,
     settings: Settings,
-    *,
-    seed: int,
-    clearance_contact: bool,
-) -> Score:
-    """Fly every tube once from a random start.
+    conditions: Conditions,
+    register_walls: RegisterWalls | None = None,
+) -> list[EpisodeResult]:
+    """Fly episodes, as many side by side as the session has lanes; how they end does not depend on how many.
 
     Args:
-        session: an open session with one lane a tube.
-        tubes: from `agent_client.tubes.draw_tube`, of the domain "evaluate".
-        make_controller: makes who flies, given the tubes.
+        session: an open session.
+        episodes: what to fly.
+        make_controller: makes who flies.
         settings: constants of the task.
-        seed: of the starts; lane i has a seed of its own made of it.
-        clearance_contact: whether contact is known from the clearance rather than from physics.
+        conditions: ranges that each episode draws from.
+        register_walls: for a plant with walls, which then reports contact; None for one without, where contact
+            is judged from the clearance.
     """
-    geometry = SweptGeometry(tubes, len(tubes))
-    seeds = np.random.SeedSequence(seed).generate_state(len(tubes), np.uint32).tolist()
-    result = fly(
-        session,
-        geometry,
-        make_controller(geometry),
-        settings,
-        seeds=seeds,
-        clearance_contact=clearance_contact,
-    )
-    return summarise(result, geometry.length, settings.speed_max * session.dt)
+    results: list[EpisodeResult] = []
+    lanes = session.lanes
+    for start in range(0, len(episodes), lanes):
+        group = list(episodes[start : start + lanes])
+        flown = group + [group[-1]] * (lanes - len(group))  # lanes too many fly the last one again
+        tubes = [episode.tube() for episode in group]
+        tubes += [tubes[-1]] * (lanes - len(group))
+        walls = [NO_TUBE] * lanes if register_walls is None else list(register_walls(session, tubes))
+        geometry = SweptGeometry(tubes, lanes)
+        result = fly(
+            session,
+            geometry,
+            make_controller(geometry),
+            settings,
+            seeds=[episode.seed for episode in flown],
+            tube=walls,
+            drawn=draw_conditions(conditions, [(episode.seed,) for episode in flown]),
+            clearance_contact=register_walls is None,
+        )
+        fewest = geometry.length / (settings.speed_max * session.dt)
+        results += [
+            EpisodeResult(
+                episode.level,
+                episode.seed,
+                result.outcome[lane],
+                int(result.steps[lane]),
+                float(result.progress[lane]),
+                float(result.quality[lane]),
+                float(result.min_clearance[lane]),
+                int(result.contacts[lane]),
+                float(result.steps[lane] / fewest[lane]),
+            )
+            for lane, episode in enumerate(group)
+        ]
+    return results
 
 
-def summarise(result: FlightResult, length: Floats, top_step: float) -> Score:
-    """Put the lanes of a flight into one score.
-
-    Args:
-        result: a flight that went on until every episode was over.
-        length: (N,) lengths of the lanes' tubes (m).
-        top_step: way in one control step at the fastest speed level (m).
-    """
-    outcome = np.array(result.outcome)
-    success = outcome == Outcome.SUCCESS
-    ratios = (result.steps * top_step / length)[success]
+def summarise(results: Sequence[EpisodeResult]) -> Score:
+    """Put episodes into one score."""
+    outcomes = [result.outcome for result in results]
+    shares = {outcome: outcomes.count(outcome) / len(outcomes) for outcome in Outcome}
+    ratios = [result.length_ratio for result in results if result.outcome == Outcome.SUCCESS]
     return Score(
-        episodes=len(outcome),
-        success=float(success.mean()),
-        exit=float((outcome == Outcome.EXIT).mean()),
-        collision=float((outcome == Outcome.COLLISION).mean()),
-        timeout=float((outcome == Outcome.TIMEOUT).mean()),
-        quality=float(result.quality.mean()),
-        mean_steps=float(result.steps.mean()),
-        length_ratio=float(ratios.mean()) if success.any() else float("nan"),
+        episodes=len(results),
+        success=shares[Outcome.SUCCESS],
+        exit=shares[Outcome.EXIT],
+        collision=shares[Outcome.COLLISION],
+        timeout=shares[Outcome.TIMEOUT],
+        quality=float(np.mean([result.quality for result in results])),
+        mean_steps=float(np.mean([result.steps for result in results])),
+        length_ratio=float(np.mean(ratios)) if ratios else math.nan,
+        success_ci95=wilson(outcomes.count(Outcome.SUCCESS), len(outcomes)),
     )
+
+
+Z95: Final = 1.959963984540054
+"""The 97.5 % point of the normal distribution."""
+
+
+def wilson(successes: int, trials: int) -> tuple[float, float]:
+    """The 95 % score interval of a proportion (Wilson 1927)."""
+    share, square = successes / trials, Z95**2
+    centre = (share + square / (2 * trials)) / (1.0 + square / trials)
+    half = (
+        Z95 * math.sqrt(share * (1.0 - share) / trials + square / (4 * trials**2)) / (1.0 + square / trials)
+    )
+    return max(centre - half, 0.0), min(centre + half, 1.0)

@@ -10,7 +10,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from agent_client.actuation import CommandPath
 from agent_client.controllers import CONTINUOUS, Controller
+from agent_client.episodes import Records
 from agent_client.settings import Settings
 from agent_client.start import build_resets
 from agent_client.task import OnContact, Outcome, TaskStep, TubeTask
@@ -81,8 +83,9 @@ def fly(
     settings: Settings,
     *,
     seeds: Sequence[int],
-    tube: int = NO_TUBE,
+    tube: int | Sequence[int] = NO_TUBE,
     parameters: Mapping[str, float] | None = None,
+    drawn: Records | None = None,
     clearance_contact: bool = False,
     on_contact: OnContact = "end",
     step_limit: int | None = None,
@@ -98,8 +101,10 @@ def fly(
         controller: who flies.
         settings: constants of the task.
         seeds: (N,) one a lane, of its start and of the plant's disturbance.
-        tube: index of the registered tube that physics resets the lanes into.
+        tube: index of the registered tube that physics resets the lanes into, one for all or one a lane.
         parameters: plant parameters by name that differ from the plant's defaults.
+        drawn: (N,) conditions of the episodes (`agent_client.conditions.draw_conditions`), None for those of the
+            settings and the parameters.
         clearance_contact: whether contact is known from the clearance rather than from physics.
         on_contact: "end" or "continue", see `TubeTask`.
         step_limit: control steps until a time-out, None for the limit of each tube.
@@ -118,12 +123,15 @@ def fly(
         on_contact=on_contact,
         step_limit=step_limit,
     )
-    resets = build_resets(session.description, geometry, settings, seeds, tube=tube, parameters=parameters)
+    resets = build_resets(
+        session.description, geometry, settings, seeds, tube=tube, parameters=parameters, drawn=drawn
+    )
     commands = CommandBatch.zeros(geometry.lanes)
     actions: Ints = np.full(geometry.lanes, CONTINUOUS, dtype=np.int64)
     phases, totals = np.zeros((2, len(PHASES)), dtype=np.int64)
     poses = session.reset(resets)
-    state = task.begin(np.arange(geometry.lanes), poses)
+    lanes = np.arange(geometry.lanes)
+    state = task.begin(lanes, poses, drawn)
     task.measure_clearance()  # loads compiled code, too, before the first step and not in it
     step = FlightStep(0, np.zeros_like(commands.raw), poses.raw, actions.copy(), state, phases)
     stopped = False
@@ -134,6 +142,9 @@ def fly(
         stopped = on_step is not None and bool(on_step(step))
 
     commands.compensation[:] = settings.drone.compensation
+    path = CommandPath(geometry.lanes, session.description.speed_max)
+    if drawn is not None:
+        path.begin(lanes, drawn, state, commands)
     clock = time.perf_counter_ns
     started = clock()
     while not stopped and (over := np.count_nonzero(state.outcome)) < geometry.lanes:
@@ -141,8 +152,9 @@ def fly(
         controller.act(state, commands, actions)
         if over:
             commands.speed[state.outcome != int(Outcome.RUNNING)] = 0.0
+        sent = path.send(commands, state)
         decided = clock()
-        poses = session.step(commands, report)
+        poses = session.step(sent, report)
         answered = clock()
         task.observe(poses)
         seen = clock()
@@ -152,7 +164,7 @@ def fly(
         totals += phases
         step.index += 1
         step.pose = poses.raw
-        step.command[:] = commands.raw
+        step.command[:] = sent.raw
         step.actions[:] = actions
     report()
     return FlightResult(

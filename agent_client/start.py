@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from agent_client.conditions import Records, apply_parameters
 from agent_client.errors import SettingsError
 from agent_client.frames import frames_along, quaternions
 from agent_client.settings import Settings, StartSettings
@@ -54,8 +55,9 @@ def build_resets(
     settings: Settings,
     seeds: Sequence[int],
     *,
-    tube: int = NO_TUBE,
+    tube: int | Sequence[int] = NO_TUBE,
     parameters: Mapping[str, float] | None = None,
+    drawn: Records | None = None,
 ) -> ResetBatch:
     """Resets of all lanes of a flight: lane i starts as `seeds[i]` says, whatever the other lanes do.
 
@@ -64,8 +66,9 @@ def build_resets(
         geometry: the tubes that the lanes start in.
         settings: constants of the task; the body's radius comes from here.
         seeds: (N,) one a lane: of its start, and of the plant's disturbance.
-        tube: index of the registered tube that all lanes fly in.
+        tube: index of the registered tube that lanes fly in, one for all or one a lane.
         parameters: plant parameters by name that differ from the defaults.
+        drawn: (N,) conditions of the episodes, whose plant parameters are taken in place of all others.
 
     Raises:
         SettingsError: there are not as many seeds as lanes, a parameter's name does not exist, or a tube is too
@@ -79,7 +82,8 @@ def build_resets(
         raise SettingsError(
             f"plant parameters: expected names out of {list(PARAMETER_INDEX)}, found {unknown}"
         )
-    _check_room(geometry, settings, chosen["body_radius"])
+    body_radius = np.full(geometry.lanes, chosen["body_radius"]) if drawn is None else drawn["body_radius"]
+    _check_room(geometry, settings, body_radius)
     resets = ResetBatch.zeros(geometry.lanes)
     for lane, seed in enumerate(seeds):
         draw_starts(resets, np.array([lane]), geometry, settings.start, np.random.default_rng(seed))
@@ -89,10 +93,12 @@ def build_resets(
     resets.parameters[:, : len(description.defaults)] = description.defaults
     for name, value in chosen.items():
         resets.parameters[:, PARAMETER_INDEX[name]] = value
+    if drawn is not None:
+        apply_parameters(resets, np.arange(geometry.lanes), drawn)
     return resets
 
 
-def _check_room(geometry: Geometry, settings: Settings, body_radius: float) -> None:
+def _check_room(geometry: Geometry, settings: Settings, body_radius: Floats) -> None:
     """Refuse tubes whose start is already their end, and those that the body does not fit into there.
 
     Raises:
@@ -110,10 +116,10 @@ def _check_room(geometry: Geometry, settings: Settings, body_radius: float) -> N
                 f"task.success_radius x R at the end), found {length[lane]:.4g} m, which would be flown before "
                 f"the first step; check the scale"
             )
-        if not radius[lane] > body_radius:
+        if not radius[lane] > body_radius[lane]:
             raise SettingsError(
                 f"tube of lane {lane}: R {radius[lane]:.4g} m at the start is not above the body's radius "
-                f"{body_radius:.4g} m; check the scale"
+                f"{body_radius[lane]:.4g} m; check the scale"
             )
 
 
