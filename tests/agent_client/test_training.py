@@ -25,6 +25,7 @@ from agent_client.policy import load_policy
 from agent_client.settings import Settings
 from agent_client.training import Hyperparameters, Progress, TrainingOptions, fitting_minibatch, train
 from agent_client.tubes import TubeRecipe
+from agent_client.world import WorldOptions
 
 SMALL = Hyperparameters(lanes=4, rollout=16, minibatch=32, epochs=2, hidden=(16, 8))
 
@@ -34,7 +35,13 @@ def options(out: Path, **changes: object) -> TrainingOptions:
     masked = Settings(masked_features=("progress",))
     return replace(
         TrainingOptions(
-            out, steps=180, seed=5, settings=masked, hyperparameters=SMALL, tubes=TubeRecipe((4.0,)), pool=3
+            out,
+            steps=180,
+            seed=5,
+            world=WorldOptions(masked),
+            hyperparameters=SMALL,
+            tubes=(TubeRecipe((4.0,)),),
+            pool=3,
         ),
         **changes,
     )
