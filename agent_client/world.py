@@ -6,7 +6,7 @@ The world behind the session decides the dynamics. Tubes come from pools drawn b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -32,6 +32,10 @@ Singles = NDArray[np.float32]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+Walls = Callable[[Sequence[int], Ints], None]
+"""Told, before lanes are reset into tubes, the indices of those tubes and (N,) of the tubes flown in until then;
+has the walls registered with the plant by these indices."""
+
 
 @dataclass(frozen=True)
 class WorldOptions:
@@ -45,7 +49,7 @@ class WorldOptions:
     """Whether the observation ends with what the value network alone may see (`agent_client.privileged`)."""
     registered: bool = False
     """Whether the plant knows the pools' walls, tube i of all pools together under index i, and reports contact;
-    otherwise contact is judged from the clearance."""
+    otherwise lanes fly in no tube of the plant's and contact is judged from the clearance."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,8 @@ class TubeWorld:
         curriculum: draws the level of each episode, and is told how it ended.
         options: what the lanes are flown under.
         seed: of starts, conditions and the choice of tubes.
+        walls: registers the pools' walls when they are needed; None where the options say that there are none,
+            or all are registered already.
     """
 
     def __init__(
@@ -87,6 +93,7 @@ class TubeWorld:
         curriculum: Curriculum,
         options: WorldOptions,
         seed: int,
+        walls: Walls | None = None,
     ) -> None:
         lanes, settings = session.lanes, options.settings
         self.session: Final = session
@@ -95,6 +102,7 @@ class TubeWorld:
         self.width: Final = len(options.lags) * len(FEATURES) + (WIDTH if options.privileged else 0)
         """Numbers in an observation."""
         self.geometry: Final = SweptGeometry([tube for pool in pools for tube in pool], lanes)
+        self._walls = walls
         self._sizes = [len(pool) for pool in pools]
         self._first = np.concatenate([[0], np.cumsum(self._sizes)]).tolist()
         self._task = TubeTask(self.geometry, settings, session.dt, clearance_contact=not options.registered)
@@ -156,6 +164,8 @@ class TubeWorld:
         tubes = [self._first[a] + int(rng.integers(self._sizes[a])) for a in levels]
         self.geometry.assign(lanes, tubes)
         if options.registered:
+            if self._walls is not None:
+                self._walls(tubes, self._resets.tube)
             self._resets.tube[lanes] = tubes
         self._returns[lanes] = 0.0
         seeds = [(self._seed, self._episode + i) for i in range(len(lanes))]

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Final, Literal
 
 from cosim.errors import CosimError
-from cosim.supervise import PhysicsProcess
+from cosim.supervise import PhysicsProcess, physics_command
 from protocol.agent import AgentSession, SessionSettings
 from protocol.errors import ProtocolError
+
+Engine = Literal["bullet", "reference"]
+
+ATTACH_TIMEOUT: Final = 60.0
+"""Patience for our own server's attach (s): it may compile first, on a machine that is busy."""
+
+_sessions = itertools.count()
 
 
 def rendezvous_of(connect: str | None, name: str | None, transport: str) -> str:
@@ -62,3 +71,24 @@ def physics_session(
         if process is not None and (words := process.last_words()):
             error.add_note(f"the physics process said: {words}")
         raise
+
+
+@contextmanager
+def server_session(settings: SessionSettings, engine: Engine = "bullet") -> Iterator[AgentSession]:
+    """An open session with a physics server of ours, which is started for it and ends with it.
+
+    Args:
+        settings: lanes, time steps, and slots for tubes.
+        engine: of the server; "reference" has no walls.
+
+    Raises:
+        ProtocolError: as `physics_session`.
+    """
+    rendezvous = rendezvous_of(None, f"cosim-{os.getpid()}-{next(_sessions)}-{time.time_ns() % 10**9}", "shm")
+    command = [*physics_command(None), "--engine", engine]
+    with (
+        tempfile.TemporaryDirectory(prefix="cosim-physics-") as logs,
+        PhysicsProcess(command, rendezvous, Path(logs)) as process,
+        physics_session(rendezvous, settings, process=process, attach_timeout=ATTACH_TIMEOUT) as session,
+    ):
+        yield session
