@@ -7,15 +7,15 @@ hard evaluation uses. None of this is the paper's: it flies one drone under one 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from agent_client.errors import SettingsError
+from agent_client.noise import spread_seeds
 from protocol.plant import PARAMETER_INDEX, ResetBatch
 
 Range = tuple[float, float]
@@ -94,6 +94,9 @@ PARAMETERS_OF: Final = {
 }
 """Conditions that are plant parameters (`protocol.plant.PARAMETERS`), and their names there."""
 
+_COLUMNS: Final = [NAMES.index(name) for name in PARAMETERS_OF]
+_SLOTS: Final = [PARAMETER_INDEX[name] for name in PARAMETERS_OF.values()]
+
 
 @dataclass(frozen=True)
 class Conditions:
@@ -157,26 +160,31 @@ HARD: Final = Conditions(
 
 _TAG: Final = 0xC04D  # enters the seed, so that conditions do not follow the draws of tubes and starts
 
+_WHOLE: Final = np.array([condition.whole for condition in CONDITIONS])
 
-def draw_conditions(conditions: Conditions, seeds: Sequence[Sequence[int]]) -> Records:
+
+def draw_conditions(conditions: Conditions, seeds: ArrayLike) -> Records:
     """Draw the conditions of episodes, (K,) records of DRAWN; an episode's depend on its seed alone.
 
     Args:
         conditions: the ranges.
-        seeds: one a episode, each a few whole numbers from 0 on.
+        seeds: (K, S), one a episode, each a few whole numbers from 0 to 2^64 - 1.
     """
-    drawn = np.zeros(len(seeds), DRAWN)
-    for row, seed in zip(drawn, seeds, strict=True):
-        # One draw for each condition, in the order of the table: narrowing one range moves no other's draw.
-        rng = np.random.Generator(np.random.PCG64([_TAG, *seed]))
-        shares = rng.random(len(NAMES))
-        for share, condition in zip(shares.tolist(), CONDITIONS, strict=True):
-            low, high = getattr(conditions, condition.name)
-            row[condition.name] = (
-                math.floor(low + share * (high - low + 1)) if condition.whole else low + share * (high - low)
-            )
-        row["seed"] = rng.integers(2**63)
+    words = np.asarray(seeds, dtype=np.uint64)
+    drawn = np.zeros(len(words), DRAWN)
+    # One draw for each condition, in the order of the table: narrowing one range moves no other's draw.
+    shares = np.empty((len(words), len(NAMES)))
+    spread_seeds(words, _TAG, shares, drawn["seed"])
+    low, high = np.array(list(conditions.ranges().values()), dtype=np.float64).T
+    values = _values(drawn)
+    values[:] = low + shares * (high - low + _WHOLE)
+    values[:, _WHOLE] = np.minimum(np.floor(values[:, _WHOLE]), high[_WHOLE])
     return drawn
+
+
+def _values(drawn: Records) -> NDArray[np.float64]:
+    """The conditions in records of DRAWN as a view (K, C), in the order of the table."""
+    return drawn.view(np.float64).reshape(len(drawn), -1)[:, : len(NAMES)]
 
 
 def apply_parameters(resets: ResetBatch, lanes: NDArray[np.int64], drawn: Records) -> None:
@@ -187,6 +195,5 @@ def apply_parameters(resets: ResetBatch, lanes: NDArray[np.int64], drawn: Record
         lanes: (K,) lane indices.
         drawn: (K,) conditions of their episodes.
     """
-    for name, parameter in PARAMETERS_OF.items():
-        resets.parameters[lanes, PARAMETER_INDEX[parameter]] = drawn[name]
+    resets.parameters[lanes[:, None], _SLOTS] = _values(np.ascontiguousarray(drawn))[:, _COLUMNS]
     resets.seed[lanes] = drawn["seed"].astype(np.int64)

@@ -17,6 +17,7 @@ from agent_client.episodes import Records
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Words = NDArray[np.uint64]
 
 CAMERA: Final = 0x10000
 """Index of the camera's draw, behind those of all rays."""
@@ -29,11 +30,36 @@ COMMAND: Final = 0x20000
 def uniform(seed: int, step: int, index: int) -> float:
     """A number in (0, 1): SplitMix64's mixing (Steele, Lea, Flood 2014) of seed, step and index."""
     z = np.uint64(seed) + np.uint64(step) * np.uint64(0xD1342543DE82EF95)
-    z = z + np.uint64(index + 1) * np.uint64(0x9E3779B97F4A7C15)
+    z = _mix(z + np.uint64(index + 1) * np.uint64(0x9E3779B97F4A7C15))
+    return (np.float64(z >> np.uint64(12)) + 0.5) * 2.0**-52
+
+
+@njit(cache=True)
+def _mix(z: Any) -> Any:
+    """SplitMix64's finaliser: a permutation of the 64-bit numbers after which every bit depends on all."""
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    z = z ^ (z >> np.uint64(31))
-    return (np.float64(z >> np.uint64(12)) + 0.5) * 2.0**-52
+    return z ^ (z >> np.uint64(31))
+
+
+@njit(cache=True)
+def spread_seeds(seeds: Words, tag: int, shares: Floats, fresh: Words) -> None:
+    """Make of each seed, a few whole numbers, a row of numbers in (0, 1) and one new seed.
+
+    Args:
+        seeds: (K, S) seeds.
+        tag: enters all of them, so that whoever has another tag gets other numbers from the same seed.
+        shares: (K, C) output.
+        fresh: (K,) output, below 2^63.
+    """
+    for k in range(seeds.shape[0]):
+        key = np.uint64(tag)
+        for part in seeds[k]:
+            key = _mix(key + np.uint64(0x9E3779B97F4A7C15)) ^ part
+        key = _mix(key + np.uint64(0x9E3779B97F4A7C15))
+        for c in range(shares.shape[1]):
+            shares[k, c] = uniform(key, 0, c)
+        fresh[k] = _mix(key) >> np.uint64(1)
 
 
 @njit(cache=True)
@@ -68,4 +94,4 @@ def blinded(episode: Any) -> bool:
     """Whether the camera of an episode (one record) sees nothing in this step."""
     if episode.camera_dropout <= 0.0:
         return False
-    return uniform(episode.noise_seed, episode.step, CAMERA) < episode.camera_dropout
+    return bool(uniform(episode.noise_seed, episode.step, CAMERA) < episode.camera_dropout)

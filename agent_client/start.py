@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,16 @@ from agent_client.errors import SettingsError
 from agent_client.frames import frames_along, quaternions
 from agent_client.settings import Settings, StartSettings
 from meshes.geometry import Geometry
+from meshes.swept import SweptTube
+from protocol.agent import AgentSession
 from protocol.plant import NO_TUBE, PARAMETER_INDEX, PlantDescription, ResetBatch
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+RegisterWalls = Callable[[AgentSession, Sequence[SweptTube]], Sequence[int]]
+"""Makes the walls of tubes, those that the lanes of a session fly in from now on, known to its plant; returns the
+index of each."""
 
 
 def draw_starts(

@@ -6,7 +6,7 @@ The world behind the session decides the dynamics. Tubes come from pools drawn b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -21,7 +21,7 @@ from agent_client.features import FEATURES
 from agent_client.history import PRESENT, ObservationHistory
 from agent_client.privileged import WIDTH, privileged
 from agent_client.settings import Settings
-from agent_client.start import draw_starts
+from agent_client.start import RegisterWalls, draw_starts
 from agent_client.task import Outcome, TaskStep, TubeTask
 from meshes.swept import SweptTube
 from meshes.swept_geometry import SweptGeometry
@@ -31,10 +31,6 @@ from protocol.plant import CommandBatch, PoseBatch, ResetBatch
 Singles = NDArray[np.float32]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-
-Walls = Callable[[Sequence[int], Ints], None]
-"""Told, before lanes are reset into tubes, the indices of those tubes and (N,) of the tubes flown in until then;
-has the walls registered with the plant by these indices."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +43,6 @@ class WorldOptions:
     """Ages of the observations that the policy sees (`agent_client.history`)."""
     privileged: bool = False
     """Whether the observation ends with what the value network alone may see (`agent_client.privileged`)."""
-    registered: bool = False
-    """Whether the plant knows the pools' walls, tube i of all pools together under index i, and reports contact;
-    otherwise lanes fly in no tube of the plant's and contact is judged from the clearance."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +75,8 @@ class TubeWorld:
         curriculum: draws the level of each episode, and is told how it ended.
         options: what the lanes are flown under.
         seed: of starts, conditions and the choice of tubes.
-        walls: registers the pools' walls when they are needed; None where the options say that there are none,
-            or all are registered already.
+        register_walls: for a plant with walls, which then reports contact; None for one without, where contact
+            is judged from the clearance.
     """
 
     def __init__(
@@ -93,7 +86,7 @@ class TubeWorld:
         curriculum: Curriculum,
         options: WorldOptions,
         seed: int,
-        walls: Walls | None = None,
+        register_walls: RegisterWalls | None = None,
     ) -> None:
         lanes, settings = session.lanes, options.settings
         self.session: Final = session
@@ -101,11 +94,12 @@ class TubeWorld:
         self.options: Final = options
         self.width: Final = len(options.lags) * len(FEATURES) + (WIDTH if options.privileged else 0)
         """Numbers in an observation."""
-        self.geometry: Final = SweptGeometry([tube for pool in pools for tube in pool], lanes)
-        self._walls = walls
+        self._tubes = [tube for pool in pools for tube in pool]
+        self.geometry: Final = SweptGeometry(self._tubes, lanes)
+        self._register_walls = register_walls
         self._sizes = [len(pool) for pool in pools]
         self._first = np.concatenate([[0], np.cumsum(self._sizes)]).tolist()
-        self._task = TubeTask(self.geometry, settings, session.dt, clearance_contact=not options.registered)
+        self._task = TubeTask(self.geometry, settings, session.dt, clearance_contact=register_walls is None)
         self._table = action_table(settings)
         self._commands = CommandBatch.zeros(lanes)
         self._path = CommandPath(lanes, session.description.speed_max)
@@ -116,14 +110,13 @@ class TubeWorld:
         self._drawn: Records = np.zeros(lanes, DRAWN)
         self._level: Ints = np.zeros(lanes, dtype=np.int64)
         self._returns = np.zeros(lanes)
-        self._episode = 0
         self.seed(seed)
         self.state: TaskStep
         """The task's last step, after `restart`."""
 
     def seed(self, seed: int) -> None:
-        """Begin the draws anew."""
-        self._seed = seed
+        """Begin the draws anew, with a whole number from 0 to 2^64 - 1."""
+        self._seed, self._episode = seed, 0
         self._rng = np.random.default_rng(seed)
 
     def restart(self) -> Singles:
@@ -163,12 +156,12 @@ class TubeWorld:
         self._level[lanes] = levels
         tubes = [self._first[a] + int(rng.integers(self._sizes[a])) for a in levels]
         self.geometry.assign(lanes, tubes)
-        if options.registered:
-            if self._walls is not None:
-                self._walls(tubes, self._resets.tube)
-            self._resets.tube[lanes] = tubes
+        if self._register_walls is not None:
+            flown = [self._tubes[tube] for tube in self.geometry.assigned.tolist()]
+            self._resets.tube[:] = self._register_walls(self.session, flown)
         self._returns[lanes] = 0.0
-        seeds = [(self._seed, self._episode + i) for i in range(len(lanes))]
+        seeds = np.full((len(lanes), 2), self._seed, dtype=np.uint64)
+        seeds[:, 1] = np.arange(self._episode, self._episode + len(lanes))
         self._episode += len(lanes)
         drawn = self._drawn[lanes] = draw_conditions(options.conditions, seeds)
         apply_parameters(self._resets, lanes, drawn)

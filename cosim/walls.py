@@ -1,78 +1,93 @@
-"""The walls of a pool of tubes for a physics process: written as mesh files, registered when they are needed."""
+"""The walls of swept tubes for a physics process: written as mesh files, registered when lanes first fly in them."""
 
 from __future__ import annotations
 
 import hashlib
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from agent_client.world import Ints
+from cosim.errors import CosimError
 from meshes.sweep import sweep_wall, write_obj
 from meshes.swept import SweptTube
 from protocol.agent import AgentSession
 from protocol.plant import TubeReference
 
 KEPT: Final = 256
-"""Walls that stay registered: our server takes 3 MB for each. Tubes that are flown in come on top."""
+"""Walls that stay registered; our server takes 3 MB for each."""
 
 
-class PoolWalls:
-    """Registers the walls of a pool's tubes, tube i under index i, when lanes are about to fly in them.
+def wall_slots(lanes: int) -> int:
+    """How many walls to keep for so many lanes: what to open a session with, as its `tube_slots`."""
+    return max(KEPT, 2 * lanes)
 
-    A whole pool at once would take minutes and gigabytes; a wall takes 0.1 s when it is first needed. It goes to
-    `agent_client.world.TubeWorld` as `walls`, with `WorldOptions.registered`.
+
+class WallRegistry:
+    """Registers the walls of tubes that lanes are about to fly in, and lets go those not flown in for the longest.
+
+    An `agent_client.start.RegisterWalls`. Registering a wall takes some 0.1 s, so that a whole pool at once would
+    keep a training waiting for minutes, and take gigabytes.
 
     Args:
-        session: with a plant that knows walls, opened with at least as many `tube_slots` as there are tubes.
-        tubes: of all pools together, in the order of the world's pools.
-        folder: for mesh files, each of which is gone again once the plant has read it.
-        kept: walls that stay registered though no lane flies in them, those that were needed last.
+        slots: walls that are registered at the same time, at most the session's `tube_slots`; at least two for
+            each lane, one that it leaves and one that it enters.
     """
 
-    def __init__(
-        self, session: AgentSession, tubes: Sequence[SweptTube], folder: Path, kept: int = KEPT
-    ) -> None:
-        self._session, self._tubes, self._folder, self._kept = session, tubes, folder, kept
-        self._registered: dict[int, None] = {}
-        """Indices of the registered tubes, the one that was needed last at the end."""
+    def __init__(self, slots: int = KEPT) -> None:
+        self._slots = slots
+        self._session: AgentSession | None = None
+        self._free: list[int] = []
+        self._indices: dict[SweptTube, int] = {}
+        """Index of each registered tube; the tubes that were asked for last are at the end."""
 
-    def __call__(self, needed: Sequence[int], flown: Ints) -> None:
-        """Have the walls of `needed` registered; release those that were not needed for the longest time.
+    def __call__(self, session: AgentSession, tubes: Sequence[SweptTube]) -> list[int]:
+        """Have walls registered.
 
         Args:
-            needed: indices of tubes that lanes are about to be reset into.
-            flown: indices of tubes that lanes fly in until then; any other number is of no tube.
+            session: with a plant that knows walls. One that was not seen before knows none yet.
+            tubes: those that all lanes of the session fly in from now on.
+
+        Returns:
+            The index under which each is registered.
 
         Raises:
-            Refusal: the plant takes no walls, or has fewer slots than there are tubes.
+            CosimError: there are not two slots for each lane.
+            Refusal: the plant takes no walls, or has fewer slots.
             ProtocolError: the session is over.
         """
-        for index in dict.fromkeys(needed):
-            if index in self._registered:
-                del self._registered[index]
-            else:
-                register_wall(self._session, index, self._tubes[index], self._folder)
-            self._registered[index] = None
-        if len(self._registered) > self._kept:
-            busy = {*needed, *flown.tolist()}
-            idle = [index for index in self._registered if index not in busy]
-            for index in idle[: len(self._registered) - self._kept]:
-                self._session.release_tube(index)
-                del self._registered[index]
+        if self._slots < 2 * len(tubes):
+            raise CosimError(
+                f"slots of walls: expected two for each of {len(tubes)} lanes, found {self._slots}"
+            )
+        if session is not self._session:
+            self._session, self._indices = session, {}
+            self._free = list(range(self._slots))
+        for tube in tubes:
+            index = self._indices.pop(tube, None)
+            self._indices[tube] = self._register(session, tube) if index is None else index
+        return [self._indices[tube] for tube in tubes]
+
+    def _register(self, session: AgentSession, tube: SweptTube) -> int:
+        """Register a new wall, in place of the one not asked for for the longest time where all slots are taken."""
+        if not self._free:
+            # At least as many others were asked for since as there are lanes: nobody flies in it any more.
+            oldest = next(iter(self._indices))
+            session.release_tube(self._indices[oldest])
+            self._free.append(self._indices.pop(oldest))
+        register_wall(session, self._free[-1], tube)
+        return self._free.pop()
 
 
-def register_wall(session: AgentSession, index: int, tube: SweptTube, folder: Path) -> None:
-    """Register the wall of one swept tube, by way of a mesh file in `folder` that is removed again.
+def register_wall(session: AgentSession, index: int, tube: SweptTube) -> None:
+    """Register the wall of one swept tube, by way of a mesh file that is gone again afterwards.
 
     Raises:
         Refusal: the slot is taken, or the plant takes no walls.
         ProtocolError: the session is over.
     """
-    path = folder.absolute() / f"tube-{index}.obj"
-    write_obj(path, *sweep_wall(tube))
-    try:
+    with tempfile.TemporaryDirectory(prefix="cosim-wall-") as folder:
+        path = Path(folder) / f"tube-{index}.obj"
+        write_obj(path, *sweep_wall(tube))
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
         session.register_tube(index, TubeReference(str(path), "zup", 1.0, digest))
-    finally:
-        path.unlink()
