@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -38,8 +39,14 @@ class Episode:
     domain: Domain = "evaluate"
 
     def tube(self) -> SweptTube:
-        """The episode's tube."""
-        return draw_tube(self.level, (self.seed,), self.domain, self.recipe)
+        """The episode's tube: the same object again as long as few others were asked for, since a tube is drawn in
+        milliseconds and flown by many in turn."""
+        return _draw(self)
+
+
+@lru_cache(maxsize=256)
+def _draw(episode: Episode) -> SweptTube:
+    return draw_tube(episode.level, (episode.seed,), episode.domain, episode.recipe)
 
 
 @dataclass(frozen=True)
