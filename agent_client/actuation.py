@@ -33,6 +33,7 @@ class CommandPath:
     def __init__(self, lanes: int, speed_max: float) -> None:
         self._ring: Floats = np.zeros((DELAY_MAX + 1, *CommandBatch.zeros(lanes).raw.shape))
         self._head = 0
+        self._lanes = np.arange(lanes)
         self._delay: Ints = np.zeros(lanes, dtype=np.int64)
         self._near_wall: Floats = np.zeros(lanes)
         self._speed_max = speed_max
@@ -67,8 +68,7 @@ class CommandPath:
         self._head = (self._head + 1) % len(self._ring)
         self._ring[self._head] = commands.raw
         sent = self._sent.raw
-        for lane, delay in enumerate(self._delay.tolist()):
-            sent[lane] = self._ring[(self._head - delay) % len(self._ring), lane]
+        sent[:] = self._ring[(self._head - self._delay) % len(self._ring), self._lanes]
         _blow(step.episodes, self._near_wall, self._speed_max, sent)
         return self._sent
 

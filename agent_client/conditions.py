@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -64,7 +65,7 @@ CONDITIONS: Final = (
     Condition("action_delay", "steps", "control steps from decision to plant", 0, DELAY_MAX, whole=True),
     Condition("observation_delay", "steps", "age of what the policy sees", 0, DELAY_MAX, whole=True),
     Condition("gain", "1/s", "k_v of the force law", 0.1, 100.0, needs_inertia=True),
-    Condition("compensation", "weight", "gravity compensation c; 1 hovers", 0.0, 2.0),
+    Condition("compensation", "weight", "gravity compensation c; 1 hovers", 0.0, 2.0, needs_inertia=True),
     Condition("mass", "kg", "mass of the drone", 0.01, 100.0, needs_inertia=True),
     Condition("drag", "N s/m", "linear drag", 0.0, 100.0, needs_inertia=True),
     Condition("gust", "N", "amplitude of a random force, new every control step", 0.0, 100.0, needs_inertia=True),
@@ -129,6 +130,11 @@ class Conditions:
         """The range of each condition, by name."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
+    @cached_property
+    def bounds(self) -> NDArray[np.float64]:
+        """The lower and the upper ends of the ranges, (2, C), in the order of the table."""
+        return np.array(list(self.ranges().values()), dtype=np.float64).T
+
     def changed(self) -> dict[str, Range]:
         """The ranges that differ from the defaults, by name."""
         usual = Conditions().ranges()
@@ -175,7 +181,7 @@ def draw_conditions(conditions: Conditions, seeds: ArrayLike) -> Records:
     # One draw for each condition, in the order of the table: narrowing one range moves no other's draw.
     shares = np.empty((len(words), len(NAMES)))
     spread_seeds(words, _TAG, shares, drawn["seed"])
-    low, high = np.array(list(conditions.ranges().values()), dtype=np.float64).T
+    low, high = conditions.bounds
     values = _values(drawn)
     values[:] = low + shares * (high - low + _WHOLE)
     values[:, _WHOLE] = np.minimum(np.floor(values[:, _WHOLE]), high[_WHOLE])

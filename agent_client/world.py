@@ -130,14 +130,10 @@ class TubeWorld:
         Args:
             actions: (N,) indices into the action table.
         """
-        decode(actions, self.state.frame, self._table.local, self._table.speed, self._commands.raw)
-        poses = self.session.step(self._path.send(self._commands, self.state))
-        state = self.state = self._task.observe(poses)
-        self._history.push(state.observation)
-        self._returns += state.reward
+        observation = self.advance(actions)
+        state = self.state
         outcome, reward = state.outcome.copy(), state.reward.copy()
         ended = np.flatnonzero(outcome)
-        observation = self._look(poses)
         if not len(ended):
             return WorldStep(
                 observation, reward, outcome, ended, observation[:0], state.episodes[:0],
@@ -148,6 +144,19 @@ class TubeWorld:
         for level, how in zip(levels.tolist(), outcome[ended].tolist(), strict=True):
             self.curriculum.record(level, how == Outcome.SUCCESS)
         return WorldStep(self._begin(ended), reward, outcome, ended, final, episodes, levels, returns)
+
+    def advance(self, actions: Ints) -> Singles:
+        """Take a control step in every lane and begin nothing anew: an episode that is over stays as it ended.
+
+        Returns:
+            Observations (N, W); everything else is in `state`.
+        """
+        decode(actions, self.state.frame, self._table.local, self._table.speed, self._commands.raw)
+        poses = self.session.step(self._path.send(self._commands, self.state))
+        state = self.state = self._task.observe(poses)
+        self._history.push(state.observation)
+        self._returns += state.reward
+        return self._look(poses)
 
     def _begin(self, lanes: Ints) -> Singles:
         """Draw level, tube, start and conditions of new episodes in `lanes`; returns all lanes' observations."""
