@@ -37,7 +37,7 @@ class TubeVecEnv(VecEnv):
         bound = np.inf if world.options.privileged else 1.0
         super().__init__(
             world.session.lanes,
-            spaces.Box(-bound, bound, (world.width,), np.float32),
+            spaces.Box(-bound, bound, (world.options.width,), np.float32),
             spaces.Discrete(len(action_table(world.options.settings))),
         )
         self.world: Final = world

@@ -6,9 +6,10 @@ The world behind the session decides the dynamics. Tubes come from pools drawn b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,12 +26,15 @@ from agent_client.start import RegisterWalls, draw_starts
 from agent_client.task import Outcome, TaskStep, TubeTask
 from meshes.swept import SweptTube
 from meshes.swept_geometry import SweptGeometry
-from protocol.agent import AgentSession
+from protocol.agent import AgentSession, SessionSettings
 from protocol.plant import CommandBatch, PoseBatch, ResetBatch
 
 Singles = NDArray[np.float32]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+OpenSession: TypeAlias = Callable[[SessionSettings], AbstractContextManager[AgentSession]]
+"""Opens a session to fly in."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,11 @@ class WorldOptions:
     """Ages of the observations that the policy sees (`agent_client.history`)."""
     privileged: bool = False
     """Whether the observation ends with what the value network alone may see (`agent_client.privileged`)."""
+
+    @property
+    def width(self) -> int:
+        """Numbers in an observation."""
+        return len(self.lags) * len(FEATURES) + (WIDTH if self.privileged else 0)
 
 
 @dataclass(frozen=True)
@@ -92,8 +101,6 @@ class TubeWorld:
         self.session: Final = session
         self.curriculum: Final = curriculum
         self.options: Final = options
-        self.width: Final = len(options.lags) * len(FEATURES) + (WIDTH if options.privileged else 0)
-        """Numbers in an observation."""
         self._tubes = [tube for pool in pools for tube in pool]
         self.geometry: Final = SweptGeometry(self._tubes, lanes)
         self._register_walls = register_walls
@@ -183,6 +190,7 @@ class TubeWorld:
 
     def _look(self, poses: PoseBatch) -> Singles:
         """A copy of what is seen of all lanes, (N, W)."""
+        self._task.measure_clearance()
         seen = self._history.stack()
         if not self.options.privileged:
             return seen.copy()
