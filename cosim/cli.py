@@ -13,7 +13,8 @@ import click
 
 from cosim import __version__
 from cosim.errors import INTERNAL, Terminated, exit_status
-from cosim.options import FlightOptions, flight_options
+from cosim.named_settings import SettingsCommand
+from cosim.options import FlightOptions, evaluate_options, flight_options
 
 EXIT_NO_SUCCESS: Final = 1
 
@@ -80,6 +81,22 @@ def train(preset: str, steps: int | None, seed: int, envs: int, out: Path) -> No
     from cosim.train import train as run
 
     run(preset, steps, seed, envs, out)
+
+
+@cosim.command(cls=SettingsCommand, short_help="Fly pilots through many unseen tubes, beside the paper's figures.")
+@evaluate_options
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, nothing else.")
+def evaluate(as_json: bool, **options: Any) -> None:
+    """Fly pilots through the same unseen tubes, and print the paper's table side by side.
+
+    \b
+    cosim evaluate --policy tube_ppo --policy pure-pursuit-tuned --dynamics rigid-body --hard
+    cosim evaluate --dynamics rigid-body --engine reference --sweep gain=1,2,4,8
+    """
+    from cosim.evaluate import evaluate as run
+    from cosim.evaluation_plan import read_options
+
+    run(read_options(options), as_json=as_json)
 
 
 @cosim.command(short_help="Measure round trip, control loop and start-up on this machine.")

@@ -3,7 +3,8 @@
     CosimError                      2
     ├── OutputError                 2   the run folder cannot be written, or already holds a run
     ├── RunError                    2   a run folder that cannot be read
-    └── PeerCommandError            2   the physics command cannot be started
+    ├── PeerCommandError            2   the physics command cannot be started
+    └── WorkerError                     a worker process failed; 3, or the status of what it failed of
     protocol.errors.ProtocolError   3   the other process or the protocol failed
     ├── protocol.errors.SessionError    2   our own side asked for what cannot be had (no room, name in use)
     meshes.errors.MeshError         2   the tube cannot be read
@@ -41,6 +42,17 @@ class PeerCommandError(CosimError):
     """A physics command that cannot be started."""
 
 
+class WorkerError(CosimError):
+    """A worker process failed or was killed; carries the exit status of what it failed of."""
+
+    def __init__(self, text: str, status: int = PEER) -> None:
+        super().__init__(text, status)  # both are its `args`, so that it travels between processes
+        self.status = status
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
 class Terminated(BaseException):
     """SIGTERM arrived; handled like Ctrl-C, so that both processes end and the recording is saved."""
 
@@ -57,6 +69,8 @@ def exit_status(error: BaseException) -> int | None:
         return BROKEN_PIPE
     if isinstance(error, Terminated):
         return TERMINATED
+    if isinstance(error, WorkerError):
+        return error.status
     if isinstance(error, (CosimError, MeshError, AgentError, SessionError)):
         return USAGE
     if isinstance(error, ProtocolError):

@@ -1,9 +1,11 @@
-"""The live line of a flight on a terminal; silent where stderr is none."""
+"""The live line of a flight, and a bar for many of them, on a terminal; silent where stderr is none."""
 
 from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Final, Self
 
@@ -57,3 +59,25 @@ class LiveLine:
     ) -> None:
         if self._progress is not None:
             self._progress.stop()
+
+
+@contextmanager
+def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A bar on a terminal that fills as it is told how much more was done; silent where stderr is none.
+
+    Args:
+        what: is done.
+        total: of what will be done.
+    """
+    if sys.stderr is None or not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn(what), BarColumn(30), TextColumn("{task.percentage:3.0f} %"))
+    with Progress(
+        *columns, TimeElapsedColumn(), TimeRemainingColumn(), console=Console(stderr=True), transient=True
+    ) as bar:
+        task = bar.add_task("", total=total)
+        yield lambda done: bar.advance(task, done)

@@ -69,7 +69,7 @@ def _positive(ctx: click.Context, param: click.Parameter, value: float | None) -
     return value
 
 
-_OPTIONS: Final = (
+_FLIGHT: Final = (
     click.option("--mesh", metavar="PATH", default=SHIPPED_MESH, show_default=True, help="Tube mesh."),
     click.option("--centerline", type=click.Path(path_type=Path), metavar="PATH", default=None,
                  help="Centreline .obj [default: <mesh stem>_centerline.obj beside the mesh]."),
@@ -109,8 +109,67 @@ _OPTIONS: Final = (
 )  # fmt: skip
 
 
+def _numbers(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[float, ...] | None:
+    """Read distinct numbers with commas between them, in rising order."""
+    if value is None:
+        return None
+    try:
+        numbers = {float(part) for part in value.split(",")}
+    except ValueError:
+        raise click.BadParameter(f"expected numbers such as 1,2,4, found {value!r}", ctx, param) from None
+    return tuple(sorted(numbers))
+
+
+def _levels(ctx: click.Context, param: click.Parameter, value: str) -> tuple[int, ...]:
+    """Read levels of the curriculum."""
+    levels = sorted(set(value.split(",")))
+    if not set(levels) <= {"0", "1", "2"}:
+        raise click.BadParameter(f"expected levels out of 0,1,2, found {value!r}", ctx, param)
+    return tuple(map(int, levels))
+
+
+_EVALUATE: Final = (
+    click.option("--policy", "policies", multiple=True, metavar="P",
+                 help="Checkpoint, pure-pursuit, pure-pursuit-tuned or lidar-rule; repeatable "
+                      "[default: all three and tube_ppo]."),
+    click.option("--levels", default="0,1,2", show_default=True, callback=_levels, metavar="L,L,...",
+                 help="Levels of the curriculum."),
+    click.option("--episodes", type=click.IntRange(1, 1_000_000), default=100, show_default=True,
+                 help="Tubes a level."),
+    click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True,
+                 help="Of tubes, starts and conditions; training sees none of them."),
+    click.option("--dynamics", type=click.Choice(["kinematic", "rigid-body"]), default=None,
+                 help="World [default: kinematic]."),
+    click.option("--engine", type=click.Choice(["bullet", "reference"]), default=None,
+                 help="Of rigid bodies: a PyBullet server, or in process [default: bullet]."),
+    click.option("--tuning-episodes", type=click.IntRange(5, 100_000), default=None, metavar="N",
+                 help="Tubes that tune Pure Pursuit [default: 100; 40 a cell of a map]."),
+    click.option("--sweep", metavar="NAME=V1,V2,...", help="Evaluate for each value of one named setting."),
+    click.option("--map", "draw_map", is_flag=True,
+                 help="Draw success over gain and compensation in place of the table [--dynamics rigid-body, "
+                      "--engine reference]."),
+    click.option("--map-gains", callback=_numbers, metavar="G,G,...", default="1,1.5,2,3,4,6,8",
+                 show_default=True, help="Columns of the map (1/s)."),
+    click.option("--map-compensations", callback=_numbers, metavar="C,C,...", default="0.7,0.8,0.9,1,1.1",
+                 show_default=True, help="Rows of the map (weight)."),
+    click.option("--workers", type=click.IntRange(1, 512), default=None, metavar="N",
+                 help="Processes that fly; results do not depend on it [default: the cores]."),
+    click.option("--out", type=click.Path(path_type=Path), metavar="DIR",
+                 help="Write results.json with every episode, and the map."),
+)  # fmt: skip
+
+
 def flight_options(command: Command) -> Command:
     """Give a click command the options of a flight; they arrive as keyword arguments of FlightOptions."""
-    for option in reversed(_OPTIONS):
+    return _with(_FLIGHT, command)
+
+
+def evaluate_options(command: Command) -> Command:
+    """Give a click command the options of an evaluation, for `cosim.evaluation_plan.read_options`."""
+    return _with(_EVALUATE, command)
+
+
+def _with(options: tuple[Callable[[Command], Command], ...], command: Command) -> Command:
+    for option in reversed(options):
         command = option(command)
     return command

@@ -1,0 +1,61 @@
+"""Success over gain and gravity compensation as a picture, to show where no controller succeeds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosim.errors import CosimError, OutputError
+
+
+def draw_map(path: Path, report: dict[str, Any]) -> None:
+    """Draw one panel for each pilot and level, pilots side by side and levels below each other.
+
+    Args:
+        path: the .png to write.
+        report: of an evaluation whose rows carry `gain` and `compensation`.
+
+    Raises:
+        CosimError: matplotlib is not installed.
+        OutputError: the file cannot be written.
+    """
+    try:
+        from matplotlib.figure import Figure  # without pyplot: no display, and nothing global
+    except ImportError as error:
+        raise CosimError(
+            f"--map needs {error.name}; install the extra with: pip install 'tube-cosim[view]'"
+        ) from error
+    rows = report["rows"]
+    names = list(dict.fromkeys(row["policy"] for row in rows))
+    levels = sorted({row["level"] for row in rows})
+    gains = sorted({row["gain"] for row in rows})
+    compensations = sorted({row["compensation"] for row in rows})
+    share = {(r["policy"], r["level"], r["gain"], r["compensation"]): 100.0 * r["success"] for r in rows}
+    width, height = 1.5 + 0.62 * len(gains), 1.1 + 0.45 * len(compensations)
+    figure = Figure(figsize=(width * len(names) + 1.0, height * len(levels) + 0.7), layout="constrained")
+    panels = figure.subplots(len(levels), len(names), squeeze=False, sharex=True, sharey=True)
+    for (i, j), panel in np.ndenumerate(panels):
+        cells = np.array([[share[names[j], levels[i], g, c] for g in gains] for c in compensations])
+        image = panel.imshow(cells, origin="lower", aspect="auto", cmap="viridis", vmin=0.0, vmax=100.0)
+        for (y, x), value in np.ndenumerate(cells):
+            shade = "black" if value > 55.0 else "white"
+            panel.text(x, y, f"{value:.0f}", ha="center", va="center", color=shade, fontsize=9)
+        panel.set_xticks(range(len(gains)), [f"{gain:g}" for gain in gains])
+        panel.set_yticks(range(len(compensations)), [f"{c:g}" for c in compensations])
+        panel.set_title(f"{names[j]}, level {levels[i]}", fontsize=10)
+        if i == len(levels) - 1:
+            panel.set_xlabel("gain k_v (1/s)")
+        if j == 0:
+            panel.set_ylabel("gravity compensation c (weight)")
+    figure.colorbar(image, ax=panels, label="success (%)", shrink=0.9)
+    hard = ", hard conditions otherwise" if report["hard"] else ""
+    figure.suptitle(
+        f"Success of {report['episodes']} flights a cell, engine {report['engine']}, seed {report['seed']}{hard}",
+        fontsize=10,
+    )
+    try:
+        figure.savefig(path, dpi=120)
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror}") from error

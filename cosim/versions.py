@@ -1,0 +1,21 @@
+"""Whose versions a result depends on."""
+
+from __future__ import annotations
+
+import platform
+from importlib import metadata
+from typing import Final
+
+from cosim import __version__
+
+PACKAGES: Final = ("numpy", "numba", "pybullet", "embreex")
+"""Libraries whose versions are recorded: a run may differ where they do."""
+
+
+def versions() -> dict[str, str]:
+    """Versions of cosim, Python and the libraries, by name."""
+    return {
+        "cosim": __version__,
+        **{name: metadata.version(name) for name in PACKAGES},
+        "python": platform.python_version(),
+    }
