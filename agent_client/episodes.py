@@ -8,6 +8,7 @@ it would not notice; therefore the record of the constants carries a digest of t
 from __future__ import annotations
 
 import hashlib
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
@@ -117,6 +118,7 @@ def constants(settings: Settings, dt: float, *, clearance_contact: bool, on_cont
     return record
 
 
+@cache
 def _digest() -> str:
     """Digest of the files in _COMPILED, as hexadecimal digits."""
     digest = hashlib.blake2b(digest_size=8)

@@ -120,7 +120,7 @@ class TubeEnv(gymnasium.Env[Singles, np.int64]):
         self.options: Final = options or TubeEnvOptions()
         self.observation_space, self.action_space, self._actions = _spaces(self.options.world)
         self._register_walls = register_walls
-        self._session, self._close = _hold(self, self.options.open(1, open_session))
+        self.session, self._close = _hold(self, self.options.open(1, open_session))
         self._tubes: dict[tuple[int, int], SweptTube] = {}
         self._world: TubeWorld | None = None
         """That of the episode, until it is over."""
@@ -151,7 +151,7 @@ class TubeEnv(gymnasium.Env[Singles, np.int64]):
             raise SettingsError(f"tube_seed: expected a whole number from 0 on, found {tube_seed!r}")
         self._level, self._tube_seed = level, tube_seed
         self._world = TubeWorld(
-            self._session,
+            self.session,
             _pools(level, [self._tube(level, tube_seed)]),
             _stay(level),
             self.options.world,
@@ -231,10 +231,10 @@ class TubeVectorEnv(VectorEnv[Singles, Ints, NDArray[Any]]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         pool = [self.options.draw(level, seed) for seed in range(self.options.pool)]
-        session, self._close = _hold(self, self.options.open(num_envs, open_session))
+        self.session, self._close = _hold(self, self.options.open(num_envs, open_session))
         self.closed = False
         self._world = TubeWorld(
-            session, _pools(level, pool), _stay(level), self.options.world, 0, register_walls
+            self.session, _pools(level, pool), _stay(level), self.options.world, 0, register_walls
         )
         self._begun = False
 

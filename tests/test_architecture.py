@@ -35,6 +35,7 @@ LEARNING_FILES = {
     "agent_client/environment.py",
     "agent_client/gym_env.py",
     "agent_client/training.py",
+    "agent_client/training_state.py",
     "agent_client/sb3_policy.py",
     "cosim/gym.py",  # registers the ids, which is all that it does
 }

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -11,9 +12,12 @@ pytest.importorskip("stable_baselines3", reason="the extra 'train' is not instal
 
 from agent_client.curriculum import Curriculum
 from agent_client.environment import REWARD_SCALE, TubeVecEnv
+from agent_client.history import PRESENT
 from agent_client.kinematic import KinematicPlant
-from agent_client.settings import Settings
+from agent_client.privileged import WIDTH
+from agent_client.settings import RewardSettings, Settings
 from agent_client.tubes import TubeRecipe, draw_pool, draw_tube
+from agent_client.world import TubeWorld, WorldOptions
 from protocol.agent import SessionSettings
 from protocol.twin import open_twin
 
@@ -27,11 +31,22 @@ def make_pools(count: int = 4) -> list:
 
 
 @pytest.fixture
-def env() -> Iterator[TubeVecEnv]:
-    """Five kinematic lanes in short tubes, seed 3."""
-    settings = Settings()
-    with open_twin(KinematicPlant(settings), SessionSettings(lanes=LANES, dt=0.1, physics_dt=0.1)) as session:
-        yield TubeVecEnv(session, make_pools(), Curriculum(), settings, seed=3)
+def make_env() -> Iterator[Callable[..., TubeVecEnv]]:
+    """Makes environments of five kinematic lanes in short tubes, seed 3."""
+    with ExitStack() as sessions:
+
+        def make(options: WorldOptions | None = None) -> TubeVecEnv:
+            settings = SessionSettings(lanes=LANES, dt=0.1, physics_dt=0.1)
+            session = sessions.enter_context(open_twin(KinematicPlant(), settings))
+            return TubeVecEnv(TubeWorld(session, make_pools(), Curriculum(), options or WorldOptions(), 3))
+
+        yield make
+
+
+@pytest.fixture
+def env(make_env: Callable[..., TubeVecEnv]) -> TubeVecEnv:
+    """The environment of the default options."""
+    return make_env()
 
 
 def roll(env: TubeVecEnv, steps: int, seed: int = 0) -> list:
@@ -98,26 +113,30 @@ def test_the_return_is_the_sum_of_unscaled_rewards(env: TubeVecEnv) -> None:
     assert ended > 0
 
 
-def test_centring_pays_for_flying_in_the_middle(env: TubeVecEnv) -> None:
+def test_centring_pays_for_flying_in_the_middle(make_env: Callable[..., TubeVecEnv]) -> None:
     """With a weight, the learner's reward is the task's plus weight x S_center x way flown over v_max dt."""
-    shaped = TubeVecEnv(env.session, make_pools(), Curriculum(), Settings(), seed=3, centring=2.0)
-    actions = np.full(LANES, 3)
-    before = None
-    plain_rewards = []
-    env.seed(1)
-    env.reset()
+    plain = make_env()
+    shaped = make_env(WorldOptions(Settings(reward=RewardSettings(centring=2.0))))
+    np.testing.assert_array_equal(plain.reset(), shaped.reset())
+    before = plain.world.state.axis.arc_length.copy()
     for _ in range(4):
-        plain_rewards.append(env.step(actions)[1])
-    shaped.seed(1)
-    shaped.reset()
-    for plain in plain_rewards:
-        reward = shaped.step(actions)[1]
-        step = shaped.last
-        if before is not None:
-            share = np.minimum((step.axis.arc_length - before) / 0.2, 1.0)
-            expected = plain + REWARD_SCALE * 2.0 * step.centring * share
-            np.testing.assert_allclose(reward, expected, atol=1e-6)
-        before = step.axis.arc_length.copy()
+        rewards = [env.step(np.full(LANES, 3))[1] for env in (plain, shaped)]
+        state = plain.world.state
+        share = np.minimum((state.axis.arc_length - before) / 0.2, 1.0)
+        added = REWARD_SCALE * 2.0 * state.centring * share
+        np.testing.assert_allclose(rewards[1], rewards[0] + added, atol=1e-6)
+        before = state.axis.arc_length.copy()
+
+
+def test_spaces_tell_what_the_world_shows(make_env: Callable[..., TubeVecEnv]) -> None:
+    """Stacked observations are as many times wider, in the same bounds; what is privileged has none."""
+    stacked = make_env(WorldOptions(lags=(0, 1, 5))).observation_space
+    assert stacked.shape == (3 * 37,)
+    assert stacked.high.max() == 1.0
+    hidden = make_env(WorldOptions(lags=PRESENT, privileged=True))
+    assert hidden.observation_space.shape == (37 + WIDTH,)
+    assert np.isinf(hidden.observation_space.high).all()
+    assert hidden.reset().shape == (LANES, 37 + WIDTH)
 
 
 def test_the_same_seed_gives_the_same_episodes(env: TubeVecEnv) -> None:
