@@ -29,7 +29,7 @@ from protocol.agent import AgentSession
 OpenSession = Callable[[int], AgentSession]
 """Opens a session of so many lanes with the plant that is tuned for."""
 
-LOOKAHEADS: Final = (0.3, 0.45, 0.65, 0.9, 1.2, 1.6, 2.2, 3.0)
+LOOKAHEADS: Final = (0.15, 0.2, 0.3, 0.45, 0.7, 1.0, 1.5, 2.0, 3.0)
 """Look-aheads that are tried (m)."""
 
 TUNING_EPISODES: Final = 100
