@@ -82,7 +82,9 @@ class PurePursuit(Controller):
     """Flies towards the point of the exact axis that lies a fixed arc length ahead, at one speed.
 
     It knows the centreline, which no drone in an unknown tube does: the reference of the paper's comparison.
-    Beyond the end of the tube the axis is prolonged straight.
+    Beyond the end of the tube the axis is prolonged straight. Where it is and where the axis is it knows from the
+    simulation and not from sensors: their noise and drop-outs and the observation's delay do not touch it, while
+    an action's delay and everything that acts on the body do.
 
     Args:
         geometry: the tubes.

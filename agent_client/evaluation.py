@@ -65,6 +65,8 @@ class EpisodeResult:
     """Control steps with contact."""
     length_ratio: float
     """Steps over length / (v_max dt), the fewest possible."""
+    conditions: dict[str, float]
+    """What the episode drew of those conditions that are ranges (`agent_client.conditions`)."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,7 @@ def fly_episodes(
     """
     results: list[EpisodeResult] = []
     lanes = session.lanes
+    varied = [name for name, (low, high) in conditions.ranges().items() if low < high]
     for start in range(0, len(episodes), lanes):
         group = list(episodes[start : start + lanes])
         flown = group + [group[-1]] * (lanes - len(group))  # lanes too many fly the last one again
@@ -130,6 +133,7 @@ def fly_episodes(
         tubes += [tubes[-1]] * (lanes - len(group))
         walls = [NO_TUBE] * lanes if register_walls is None else list(register_walls(session, tubes))
         geometry = SweptGeometry(tubes, lanes)
+        drawn = draw_conditions(conditions, [(episode.seed,) for episode in flown])
         result = fly(
             session,
             geometry,
@@ -137,7 +141,7 @@ def fly_episodes(
             settings,
             seeds=[episode.seed for episode in flown],
             tube=walls,
-            drawn=draw_conditions(conditions, [(episode.seed,) for episode in flown]),
+            drawn=drawn,
             clearance_contact=register_walls is None,
         )
         fewest = geometry.length / (settings.speed_max * session.dt)
@@ -152,6 +156,7 @@ def fly_episodes(
                 float(result.min_clearance[lane]),
                 int(result.contacts[lane]),
                 float(result.steps[lane] / fewest[lane]),
+                {name: float(drawn[name][lane]) for name in varied},
             )
             for lane, episode in enumerate(group)
         ]
@@ -159,7 +164,7 @@ def fly_episodes(
 
 
 def summarise(results: Sequence[EpisodeResult]) -> Score:
-    """Put episodes into one score."""
+    """Put episodes, at least one, into one score."""
     outcomes = [result.outcome for result in results]
     shares = {outcome: outcomes.count(outcome) / len(outcomes) for outcome in Outcome}
     ratios = [result.length_ratio for result in results if result.outcome == Outcome.SUCCESS]
@@ -181,10 +186,11 @@ Z95: Final = 1.959963984540054
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """The 95 % score interval of a proportion (Wilson 1927)."""
+    """The 95 % score interval of a proportion (Wilson 1927), of at least one trial."""
     share, square = successes / trials, Z95**2
     centre = (share + square / (2 * trials)) / (1.0 + square / trials)
     half = (
         Z95 * math.sqrt(share * (1.0 - share) / trials + square / (4 * trials**2)) / (1.0 + square / trials)
     )
-    return max(centre - half, 0.0), min(centre + half, 1.0)
+    # The interval holds the proportion; rounding would let it miss 0 and 1 by a hair.
+    return min(max(centre - half, 0.0), share), max(min(centre + half, 1.0), share)

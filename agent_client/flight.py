@@ -18,7 +18,7 @@ from agent_client.start import build_resets
 from agent_client.task import OnContact, Outcome, TaskStep, TubeTask
 from meshes.geometry import Geometry
 from protocol.agent import AgentSession
-from protocol.plant import NO_TUBE, CommandBatch
+from protocol.plant import NO_TUBE, CommandBatch, ResetBatch
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -126,56 +126,103 @@ def fly(
     resets = build_resets(
         session.description, geometry, settings, seeds, tube=tube, parameters=parameters, drawn=drawn
     )
-    commands = CommandBatch.zeros(geometry.lanes)
-    actions: Ints = np.full(geometry.lanes, CONTINUOUS, dtype=np.int64)
-    phases, totals = np.zeros((2, len(PHASES)), dtype=np.int64)
-    poses = session.reset(resets)
-    lanes = np.arange(geometry.lanes)
-    state = task.begin(lanes, poses, drawn)
-    task.measure_clearance()  # loads compiled code, too, before the first step and not in it
-    step = FlightStep(0, np.zeros_like(commands.raw), poses.raw, actions.copy(), state, phases)
-    stopped = False
+    loop = _Loop(session, task, controller, on_step)
+    loop.begin(resets, drawn)
+    started = time.perf_counter_ns()
+    while loop.goes_on():
+        loop.advance()
+    loop.report()
+    return loop.result(time.perf_counter_ns() - started)
 
-    def report() -> None:
-        nonlocal stopped
-        task.measure_clearance()
-        stopped = on_step is not None and bool(on_step(step))
 
-    commands.compensation[:] = settings.drone.compensation
-    path = CommandPath(geometry.lanes, session.description.speed_max)
-    if drawn is not None:
-        path.begin(lanes, drawn, state, commands)
-    clock = time.perf_counter_ns
-    started = clock()
-    while not stopped and (over := np.count_nonzero(state.outcome)) < geometry.lanes:
+class _Loop:
+    """The lanes of one flight, from control step to control step.
+
+    Args:
+        session: an open session.
+        task: of the flight.
+        controller: who flies.
+        on_step: as for `fly`.
+    """
+
+    def __init__(
+        self,
+        session: AgentSession,
+        task: TubeTask,
+        controller: Controller,
+        on_step: Callable[[FlightStep], bool | None] | None,
+    ) -> None:
+        self._session, self._task, self._controller, self._on_step = session, task, controller, on_step
+        self._commands = CommandBatch.zeros(task.lanes)
+        self._commands.compensation[:] = task.settings.drone.compensation
+        self._path = CommandPath(task.lanes, session.description.speed_max)
+        self._actions: Ints = np.full(task.lanes, CONTINUOUS, dtype=np.int64)
+        self._totals: Ints = np.zeros(len(PHASES), dtype=np.int64)
+        self._stopped = False
+        self._over = 0
+        self._step: FlightStep
+
+    def begin(self, resets: ResetBatch, drawn: Records | None) -> None:
+        """Reset every lane and take the first look."""
+        lanes = np.arange(self._task.lanes)
+        poses = self._session.reset(resets)
+        state = self._task.begin(lanes, poses, drawn)
+        self._task.measure_clearance()  # loads compiled code, too, before the first step and not in it
+        if drawn is not None:
+            self._path.begin(lanes, drawn, state, self._commands)
+        phases: Ints = np.zeros_like(self._totals)
+        command = np.zeros_like(self._commands.raw)
+        self._step = FlightStep(0, command, poses.raw, self._actions.copy(), state, phases)
+
+    def goes_on(self) -> bool:
+        """Whether nobody stopped the flight and a lane still flies."""
+        self._over = int(np.count_nonzero(self._step.task.outcome))
+        return not self._stopped and self._over < self._task.lanes
+
+    def advance(self) -> None:
+        """Take a control step; the one before it is reported while physics works."""
+        step, task, clock = self._step, self._task, time.perf_counter_ns
         begun = clock()
-        controller.act(state, commands, actions)
-        if over:
-            commands.speed[state.outcome != int(Outcome.RUNNING)] = 0.0
-        sent = path.send(commands, state)
+        self._controller.act(step.task, self._commands, self._actions)
+        sent = self._path.send(self._commands, step.task)
+        if self._over:  # whatever is still on its way to them, or blows there
+            sent.speed[step.task.outcome != int(Outcome.RUNNING)] = 0.0
         decided = clock()
-        poses = session.step(sent, report)
+        poses = self._session.step(sent, self.report)
         answered = clock()
         task.observe(poses)
         seen = clock()
-        physics = int(1e9 * session.engine_seconds)
-        rays = task.ray_nanoseconds
-        phases[:] = (answered - decided - physics, physics, rays, seen - answered - rays, decided - begun)
-        totals += phases
+        physics, rays = int(1e9 * self._session.engine_seconds), task.ray_nanoseconds
+        step.phases[:] = (
+            answered - decided - physics,
+            physics,
+            rays,
+            seen - answered - rays,
+            decided - begun,
+        )
+        self._totals += step.phases
         step.index += 1
         step.pose = poses.raw
         step.command[:] = sent.raw
-        step.actions[:] = actions
-    report()
-    return FlightResult(
-        outcome=tuple(Outcome(value) for value in state.outcome.tolist()),
-        steps=state.step.copy(),
-        progress=state.progress.copy(),
-        quality=state.quality.copy(),
-        min_clearance=state.min_clearance.copy(),
-        contacts=state.contacts.copy(),
-        sim_time=np.multiply(state.step, session.dt, dtype=np.float64),
-        control_steps=step.index,
-        wall_time=1e-9 * (clock() - started),
-        phases=totals,
-    )
+        step.actions[:] = self._actions
+
+    def report(self) -> None:
+        """Show the last step to `on_step`."""
+        self._task.measure_clearance()
+        self._stopped = self._on_step is not None and bool(self._on_step(self._step))
+
+    def result(self, wall_nanoseconds: int) -> FlightResult:
+        """How the flight went, and that it took so long."""
+        state = self._step.task
+        return FlightResult(
+            outcome=tuple(Outcome(value) for value in state.outcome.tolist()),
+            steps=state.step.copy(),
+            progress=state.progress.copy(),
+            quality=state.quality.copy(),
+            min_clearance=state.min_clearance.copy(),
+            contacts=state.contacts.copy(),
+            sim_time=np.multiply(state.step, self._session.dt, dtype=np.float64),
+            control_steps=self._step.index,
+            wall_time=1e-9 * wall_nanoseconds,
+            phases=self._totals,
+        )
