@@ -13,7 +13,7 @@ import click
 
 from cosim import __version__
 from cosim.errors import INTERNAL, Terminated, exit_status
-from cosim.named_settings import SettingsCommand
+from cosim.named_settings import SettingsCommand, take_settings
 from cosim.options import FlightOptions, evaluate_options, flight_options
 
 EXIT_NO_SUCCESS: Final = 1
@@ -32,7 +32,7 @@ def cosim() -> None:
     """
 
 
-@cosim.command(short_help="Fly a policy through a tube in a separate physics process.")
+@cosim.command(cls=SettingsCommand, short_help="Fly a policy through a tube in a separate physics process.")
 @flight_options
 @click.option("--require-success", is_flag=True, help="Exit 1 unless the outcome is success.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, nothing else.")
@@ -41,10 +41,12 @@ def launch(require_success: bool, as_json: bool, **options: Any) -> None:
 
     \b
     cosim launch --mesh industrial.obj --policy tube_ppo --seed 3
+    cosim launch --tube level=2,seed=1234 --hard
     """
     from cosim.launch import launch as run
 
-    success = run(FlightOptions(**options), as_json=as_json)
+    settings = take_settings(options)
+    success = run(FlightOptions(settings=settings, **options), as_json=as_json)
     if require_success and not success:
         sys.exit(EXIT_NO_SUCCESS)
 

@@ -18,11 +18,13 @@ from cosim.errors import CosimError
 from cosim.named_settings import NamedSettings, option_name, parse_setting, setting_names, take_settings
 from cosim.options import SHIPPED_POLICY
 from cosim.pilots import (
+    ANY_DRONE,
     LIDAR_RULE,
     PURE_PURSUIT,
     TUNED_PURSUIT,
     Pilot,
     PilotChoice,
+    Terms,
     choose_pilot,
     read_pilot,
 )
@@ -142,7 +144,7 @@ def make_plan(options: EvaluateOptions) -> Plan:
         variants = _map_variants(options, options.grid, conditions, recipe)
     elif options.sweep is not None:
         variants = _sweep_variants(options, options.sweep, engine, conditions, recipe)
-    return Plan(engine, _pilots(options), tuple(variants), left_out)
+    return Plan(engine, _pilots(options, conditions), tuple(variants), left_out)
 
 
 def _engine(options: EvaluateOptions) -> Engine:
@@ -197,8 +199,11 @@ def _sweep_variants(
     return [Variant({name: value}, conditions, replace(recipe, **{name: value})) for value in values]
 
 
-def _pilots(options: EvaluateOptions) -> dict[PilotChoice, Pilot]:
+def _pilots(options: EvaluateOptions, conditions: Conditions) -> dict[PilotChoice, Pilot]:
     """Who flies, each read once here so that nothing starts for a checkpoint that cannot be flown."""
+    fixed = {name: span[0] for name, span in conditions.changed().items() if span[0] == span[1]}
+    drone: dict[str, float] = {name: fixed[name] for name in ("body_radius", "compensation") if name in fixed}
+    terms = Terms(allowed=ANY_DRONE, drone=drone)
     names = options.policies or POLICIES
     if options.grid is not None:
         names = (*(options.policies or (SHIPPED_POLICY,)), TUNED_PURSUIT)
@@ -209,5 +214,5 @@ def _pilots(options: EvaluateOptions) -> dict[PilotChoice, Pilot]:
             choice = replace(choice, lookahead=Settings().camera.target_distance)
         # What is found by tuning is not known yet; all else of that pilot is.
         known = replace(choice, name=PURE_PURSUIT) if name == TUNED_PURSUIT else choice
-        pilots[choice] = read_pilot(known)
+        pilots[choice] = read_pilot(known, terms)
     return pilots

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator, Mapping
 from itertools import groupby
 from typing import Any, Final
 
 from cosim.named_settings import option_name, write_value
+
+WIDTH: Final = 110
+"""Of a line of prose."""
 
 Row = Mapping[str, Any]
 
@@ -24,7 +28,7 @@ WORLDS: Final = {
 
 def table_lines(report: Row) -> Iterator[str]:
     """The table: for each level, or value of a sweep and level, the paper's rows and those that were flown."""
-    yield from _heading(report)
+    yield from _wrapped(_heading(report))
     for (value, level), group in groupby(report["rows"], key=lambda row: (row.get("value"), row["level"])):
         flown = list(group)
         setting = flown[0].get("setting")
@@ -38,7 +42,12 @@ def table_lines(report: Row) -> Iterator[str]:
         for row in flown:
             yield _line(f"  {row['policy']}", row, width)
     yield ""
-    yield from _legend(report)
+    yield from _wrapped(_legend(report))
+
+
+def _wrapped(lines: Iterator[str]) -> Iterator[str]:
+    for line in lines:
+        yield from textwrap.wrap(line, WIDTH, subsequent_indent="  ", break_on_hyphens=False)
 
 
 def _heading(report: Row) -> Iterator[str]:
@@ -89,8 +98,10 @@ def _text(value: Any) -> str:
 
 def _legend(report: Row) -> Iterator[str]:
     """What was flown, and what each pilot knew."""
-    yield "success, exit, collision, time-out in %; 95 %: Wilson's interval of the success; Q: centring and"
-    yield "alignment; length: steps over the fewest possible, of the successes; the paper's exits include collisions"
+    yield (
+        "success, exit, collision, time-out in %; 95 %: Wilson's interval of the success; Q: centring and alignment; "
+        "length: steps over the fewest possible, of the successes; the paper tells exits and collisions not apart"
+    )
     rows = report["rows"]
     for name in dict.fromkeys(row["policy"] for row in rows):
         own = [row for row in rows if row["policy"] == name]
@@ -107,7 +118,7 @@ def _legend(report: Row) -> Iterator[str]:
 
 def map_lines(report: Row) -> Iterator[str]:
     """Success (%) over gain and compensation, a block for each pilot and level."""
-    yield from _heading(report)
+    yield from _wrapped(_heading(report))
     rows = report["rows"]
     gains = sorted({row["gain"] for row in rows})
     cells = {(row["policy"], row["level"], row["gain"], row["compensation"]): row["success"] for row in rows}
@@ -118,4 +129,4 @@ def map_lines(report: Row) -> Iterator[str]:
         for c in sorted({row["compensation"] for row in rows}, reverse=True):
             yield f"{c:12g}      " + "".join(f"{100 * cells[name, level, gain, c]:7.1f}" for gain in gains)
     yield ""
-    yield from _legend(report)
+    yield from _wrapped(_legend(report))

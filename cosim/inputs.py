@@ -1,4 +1,4 @@
-"""From what the user named to what is flown: tube, policy, time steps and plant parameters, or a refusal."""
+"""From what the user named to what is flown through: a tube from files or a generated one, conditions, parameters."""
 
 from __future__ import annotations
 
@@ -9,150 +9,183 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
-import agent_client
-from agent_client.contract import require_match, running_contract
-from agent_client.controllers import DEFAULT_LOOKAHEAD, Controller, PolicyController, PurePursuit
-from agent_client.errors import ContractMismatch
-from agent_client.policy import load_policy
-from agent_client.settings import DEFAULT_DT, Settings
-from cosim.errors import CosimError
-from cosim.options import SHIPPED_MESH, SHIPPED_POLICY, FlightOptions
+from agent_client.conditions import NAMES, PARAMETERS_OF, Conditions, Records, draw_conditions
+from agent_client.tubes import TubeRecipe, draw_tube
+from cosim.errors import CosimError, OutputError
+from cosim.named_settings import option_name
+from cosim.options import SHIPPED_MESH, FlightOptions
+from cosim.pilots import existing_file
+from meshes.geometry import Geometry
 from meshes.mesh_geometry import MeshGeometry
-from meshes.tube import INDUSTRIAL, Axes, Tube, read_tube
-from protocol.plant import PARAMETER_INDEX, PARAMETERS
+from meshes.tube import INDUSTRIAL, Axes, read_tube
+from protocol.plant import PARAMETER_INDEX, PARAMETERS, TubeReference
 
-PURE_PURSUIT: Final = "pure-pursuit"
-SHIPPED_CHECKPOINT: Final = Path(agent_client.__file__).parent / "policies" / "tube_ppo.zip"
+TUBE_FILES: Final = ("tube.obj", "tube_centerline.obj")
+"""Wall and centreline of a generated tube, in the run folder."""
 
 
 @dataclass(frozen=True)
-class Pilot:
-    """Who flies: a controller, under what settings and time step, and how the manifest describes it."""
+class Conduit:
+    """What is flown through."""
 
-    controller: Controller
-    settings: Settings
-    dt: float
+    geometry: Geometry
+    """As perception sees it."""
+    reference: TubeReference
+    """Its wall, as physics is told of it."""
+    length: float
+    """Of the axis (m)."""
     description: dict[str, Any]
-    notes: tuple[str, ...]
+    """For the manifest: `mesh`, and `tube` where it was generated."""
 
 
 @dataclass(frozen=True)
-class Named:
-    """The files that the options name, before they are read."""
+class Weather:
+    """The conditions of one flight: what they were drawn from, and what came of it."""
 
-    mesh: Path
-    policy: Path | None
-    """None for Pure Pursuit."""
-    notes: tuple[str, ...]
-    """What was chosen for the user, to be said."""
+    ranges: Conditions
+    named: frozenset[str]
+    """Conditions that the user chose; of the others, those of the dynamics are the plant's own."""
+    drawn: Records  # (1,)
+    """For `agent_client.flight.fly`."""
+    parameters: Mapping[str, float]
+    """Plant parameters that the user named."""
 
     @property
-    def label(self) -> str:
-        """Names of tube and pilot for a folder."""
-        pilot = PURE_PURSUIT if self.policy is None else self.policy.stem
-        return f"{self.mesh.stem[:60]}-{pilot[:60]}"
+    def drone(self) -> dict[str, float]:
+        """The chosen ones among what a checkpoint's contract says of the drone."""
+        chosen = self.named | {
+            name for name, parameter in PARAMETERS_OF.items() if parameter in self.parameters
+        }
+        return {
+            name: float(self.drawn[name][0]) for name in ("body_radius", "compensation") if name in chosen
+        }
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the chosen conditions came to, to be said."""
+        values = ", ".join(f"{name} {self.drawn[name][0]:.4g}" for name in NAMES if name in self.named)
+        return (f"conditions: {values}",) if values else ()
+
+    def over(self, defaults: Mapping[str, float]) -> Records:
+        """What was drawn, with the plant's own values where neither a condition nor a parameter was chosen."""
+        drawn = self.drawn.copy()
+        for name, parameter in PARAMETERS_OF.items():
+            if parameter not in self.parameters and name not in (*self.named, "body_radius"):
+                drawn[name] = defaults[parameter]
+        return drawn
 
 
-def name_inputs(options: FlightOptions) -> Named:
-    """Which mesh and policy are meant; the shipped ones where their names are given and no such file exists.
+def check_options(options: FlightOptions) -> None:
+    """Refuse options that contradict each other.
 
     Raises:
-        CosimError: a file that does not exist.
+        CosimError: names the two options.
     """
-    notes = []
-    paths: dict[str, Path | None] = {}
-    for what, name, shipped_name, shipped in (
-        ("mesh", options.mesh, SHIPPED_MESH, INDUSTRIAL),
-        ("policy", options.policy, SHIPPED_POLICY, SHIPPED_CHECKPOINT),
-    ):
-        path = Path(name)
-        if name == PURE_PURSUIT and what == "policy":
-            paths[what] = None
-            continue
-        if name == shipped_name and not path.exists():
-            path = shipped
-            notes.append(f"{what}: {shipped_name} is the shipped one")
-        try:
-            found = "a folder" if path.is_dir() else "" if path.is_file() else "no such file"
-        except OSError as error:
-            found = f"one that cannot be read: {error.strerror}"
-        if found:
-            raise CosimError(f"--{what} {name}: expected a file, found {found}")
-        paths[what] = path
-    mesh = paths["mesh"]
-    assert mesh is not None
-    return Named(mesh, paths["policy"], tuple(notes))
+    if options.connect is not None and (options.server or options.session):
+        raise CosimError(
+            "--connect: a peer that you start has its own command and name; drop --server or --session"
+        )
+    if options.tube is None:
+        for name in options.settings.tubes:
+            raise CosimError(f"{option_name(name)}: only a generated tube has it; add --tube level=L,seed=N")
+    else:
+        usual = FlightOptions()
+        for name in ("mesh", "centerline", "axes", "scale", "start_end"):
+            if getattr(options, name) != getattr(usual, name):
+                raise CosimError(f"{option_name(name)}: --tube is a generated tube; drop one of them")
+        if options.tube.length is not None and "lengths" in options.settings.tubes:
+            raise CosimError("--lengths: --tube has a length= already; drop one of them")
 
 
-def read_tube_input(options: FlightOptions, named: Named) -> Tube:
-    """The tube that the options name.
+def find_mesh(options: FlightOptions) -> Path | None:
+    """The mesh that the options name, None for a generated tube.
+
+    Raises:
+        CosimError: no such file.
+    """
+    if options.tube is not None:
+        return None
+    return existing_file("mesh", options.mesh or SHIPPED_MESH, SHIPPED_MESH, INDUSTRIAL)
+
+
+def read_conduit(options: FlightOptions, mesh: Path) -> Conduit:
+    """The tube of a mesh and its centreline.
 
     Raises:
         MeshError: the mesh or its centreline cannot be used.
     """
     axes: Axes = "yup" if options.axes == "yup" else "zup"
     start_end: Literal["first", "last"] = "last" if options.start_end == "last" else "first"
-    return read_tube(named.mesh, options.centerline, axes, options.scale, start_end)
+    tube = read_tube(mesh, options.centerline, axes, options.scale, start_end)
+    reference = TubeReference(str(tube.path.resolve()), tube.axes, tube.scale, tube.sha256)
+    described = _describe(tube.path, reference, tube.centreline_path, tube.centreline_sha256, tube.length)
+    return Conduit(MeshGeometry([tube]), reference, tube.length, {"mesh": described, "tube": None})
 
 
-def read_pilot(
-    options: FlightOptions, named: Named, geometry: MeshGeometry, parameters: Mapping[str, float]
-) -> Pilot:
-    """The controller that the options name, checked against what will run.
+def generate_conduit(options: FlightOptions, recipe: TubeRecipe, folder: Path) -> Conduit:
+    """The tube that `cosim evaluate` draws for this level and seed; its wall and centreline are written to `folder`.
 
-    Naming a compensation or a body radius is allowing it; that it differs from the checkpoint's is said.
+    Physics reads the file, perception sees the swept curve itself: as in the evaluation, to the last bit.
 
     Raises:
-        AgentError: a checkpoint that cannot be read, or whose contract differs from what would run.
-        CosimError: an option that this controller does not have.
+        CurveError: no such tube was found.
+        OutputError: the folder holds such files, or cannot be written.
     """
-    chosen = {"compensation": options.compensation, "body_radius": parameters.get("body_radius")}
-    drone = {name: value for name, value in chosen.items() if value is not None}
-    base = replace(Settings(), drone=replace(Settings().drone, **drone))
-    if named.policy is None:
-        lookahead = DEFAULT_LOOKAHEAD if options.lookahead is None else options.lookahead
-        pursuit = PurePursuit(geometry, base, lookahead=lookahead)
-        return Pilot(
-            pursuit,
-            base,
-            DEFAULT_DT if options.dt is None else options.dt,
-            {
-                "name": PURE_PURSUIT,
-                "lookahead": lookahead,
-                "speed": pursuit.speed,
-                "sees": "exact centreline",
-            },
-            (),
-        )
-    if options.lookahead is not None:
-        raise CosimError("--lookahead: only --policy pure-pursuit has one")
-    path = named.policy
-    policy = load_policy(path)
-    contract = policy.contract
-    settings = replace(base, masked_features=contract.masked)
-    dt = contract.dt if options.dt is None else options.dt
-    allowed = {*options.allow_mismatch, *(f"drone.{name}" for name in drone)}
+    from cosim.walls import write_wall
+    from meshes.sweep import write_centreline_obj
+    from meshes.swept_geometry import SweptGeometry
+
+    chosen = options.tube
+    assert chosen is not None
+    if chosen.length is not None:
+        recipe = replace(recipe, lengths=(chosen.length,))
+    tube = draw_tube(chosen.level, (chosen.seed,), "evaluate", recipe)
+    wall, centreline = (folder / name for name in TUBE_FILES)
+    for path in (wall, centreline):
+        if path.exists():
+            raise OutputError(f"--out {folder}: expected a folder without {path.name}, found one")
     try:
-        mismatch = require_match(contract, running_contract(settings, dt), str(path), allowed)
-    except ContractMismatch as error:
-        if [difference.name for difference in error.differences] == ["dt"]:
-            error.add_note("--allow-mismatch dt flies it all the same")
-        raise
-    notes = tuple(
-        f"policy: {difference.name}: made for {difference.expected}, flown with {difference.found}"
-        for difference in mismatch
-    )
-    description = {
-        "name": path.stem,
-        "path": str(path),
-        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
-        "sees": f"{len(contract.observations) - len(contract.masked)} features, no centreline"
-        if contract.masked
-        else f"{len(contract.observations)} features",
-        "training": dict(contract.training),
-        "mismatch": [asdict(difference) for difference in mismatch],
+        reference = write_wall(wall, tube)
+        write_centreline_obj(centreline, tube.points)
+    except OSError as error:
+        wall.unlink(missing_ok=True)
+        raise OutputError(f"{folder}: the tube cannot be written: {error.strerror}") from error
+    sha256 = hashlib.sha256(centreline.read_bytes()).hexdigest()
+    described = {"level": chosen.level, "seed": chosen.seed, "domain": "evaluate", "recipe": asdict(recipe)}
+    mesh = _describe(wall, reference, centreline, sha256, tube.length)
+    return Conduit(SweptGeometry([tube]), reference, tube.length, {"mesh": mesh, "tube": described})
+
+
+def _describe(
+    wall: Path, reference: TubeReference, centreline: Path, centreline_sha256: str, length: float
+) -> dict[str, Any]:
+    return {
+        "path": str(wall),
+        "sha256": reference.sha256,
+        "axes": reference.axes,
+        "scale": reference.scale,
+        "centreline": str(centreline),
+        "centreline_sha256": centreline_sha256,
+        "length_m": length,
     }
-    return Pilot(PolicyController(policy, settings, contract.lags), settings, dt, description, (*policy.notes, *notes))
+
+
+def draw_weather(options: FlightOptions, conditions: Conditions, parameters: Mapping[str, float]) -> Weather:
+    """What a flight draws from its conditions, by its seed; a plant parameter that is named stands for itself.
+
+    Raises:
+        CosimError: a condition and the parameter that it stands for are both named.
+    """
+    for name, parameter in PARAMETERS_OF.items():
+        if parameter in parameters and name in options.settings.conditions:
+            raise CosimError(f"--parameter {parameter}: {option_name(name)} gives it too; drop one of them")
+    drawn = draw_conditions(conditions, [(options.start_seed,)])
+    for name, parameter in PARAMETERS_OF.items():
+        if parameter in parameters:
+            drawn[name] = parameters[parameter]
+    return Weather(
+        conditions, frozenset({*conditions.changed(), *options.settings.conditions}), drawn, parameters
+    )
 
 
 def parse_parameters(pairs: tuple[str, ...]) -> dict[str, float]:

@@ -6,39 +6,60 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import asdict
-from importlib import metadata
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import click
 
-from agent_client.episodes import episode_dtype
+from agent_client.conditions import NAMES
+from agent_client.episodes import Records, episode_dtype
 from agent_client.flight import FlightResult, FlightStep, fly
 from agent_client.settings import max_steps
 from agent_client.start import build_resets
 from agent_client.task import Outcome
 from cosim import __version__
-from cosim.errors import CosimError, Terminated
+from cosim.errors import Terminated
 from cosim.folders import check_folder, new_folder
-from cosim.inputs import Pilot, name_inputs, parse_parameters, read_pilot, read_tube_input
+from cosim.inputs import (
+    TUBE_FILES,
+    Conduit,
+    Weather,
+    check_options,
+    draw_weather,
+    find_mesh,
+    generate_conduit,
+    parse_parameters,
+    read_conduit,
+)
 from cosim.live import LiveLine
-from cosim.options import FlightOptions
-from cosim.recording import Recorder
+from cosim.options import SHIPPED_MESH, SHIPPED_POLICY, FlightOptions
+from cosim.pilots import SHIPPED_CHECKPOINT, Pilot, PilotChoice, Terms, choose_pilot, read_pilot
+from cosim.recording import MANIFEST, Recorder
 from cosim.sessions import physics_session, rendezvous_of
 from cosim.supervise import PhysicsProcess, physics_command
-from meshes.mesh_geometry import MeshGeometry
-from meshes.tube import Tube
+from cosim.versions import versions
+from meshes.tube import INDUSTRIAL
 from protocol.agent import AgentSession, SessionSettings
-from protocol.plant import PARAMETERS, TubeReference
+from protocol.plant import PARAMETERS
 
 TUBE: Final = 0
 """Index under which the flight's tube is registered."""
 
-PACKAGES: Final = ("numpy", "numba", "pybullet", "embreex")
-"""Whose versions are recorded: a run may differ where they do."""
+
+@dataclass(frozen=True)
+class Flight:
+    """All that one flight is made of."""
+
+    options: FlightOptions
+    conduit: Conduit
+    pilot: Pilot
+    weather: Weather
+    session: AgentSession
+    rendezvous: str
+    folder: Path
 
 
 def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
@@ -56,27 +77,28 @@ def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
         click.echo(text, err=as_json)
 
     check_folder(options.out)
-    if options.connect is not None and (options.server or options.session):
-        raise CosimError(
-            "--connect: a peer that you start has its own command and name; drop --server or --session"
-        )
+    check_options(options)
     command = None if options.connect is not None else physics_command(options.server)
-    parameters = parse_parameters(options.parameters)
     rendezvous = rendezvous_of(options.connect, options.session, options.transport)
-    named = name_inputs(options)
-    for note in named.notes:
+    conditions, recipe = options.settings.resolve()
+    weather = draw_weather(options, conditions, parse_parameters(options.parameters))
+    mesh, choice = find_mesh(options), choose_pilot(options.policy, options.lookahead, options.speed)
+    for note in _chosen_for_the_user(mesh, choice):
         say(note)
     with ExitStack() as stack:
-        folder = stack.enter_context(new_folder(options.out, f"{named.label}-seed{options.seed}"))
+        folder = stack.enter_context(new_folder(options.out, _label(options, mesh, choice)))
         process = None
         if command is None:
             say(f"waiting for a physics peer at {rendezvous} (at most {options.attach_timeout:g} s)")
         else:
             process = stack.enter_context(PhysicsProcess(command, rendezvous, folder))
-        tube = read_tube_input(options, named)
-        geometry = MeshGeometry([tube])
-        pilot = read_pilot(options, named, geometry, parameters)
-        for note in pilot.notes:
+        if mesh is None:
+            conduit = generate_conduit(options, recipe, folder)
+            stack.callback(_forget_unflown, folder)
+        else:
+            conduit = read_conduit(options, mesh)
+        pilot = read_pilot(choice, Terms(options.dt, options.allow_mismatch, weather.drone))
+        for note in (*pilot.notes, *weather.notes):
             say(note)
         settings = SessionSettings(1, pilot.dt, options.physics_dt)
         session = stack.enter_context(
@@ -84,42 +106,69 @@ def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
         )
         plant = session.description
         say(f"physics: {plant.name} {plant.version}, engine {plant.engine}")
-        manifest = _manifest(options, tube, pilot, session, parameters, rendezvous)
-        report = _fly_recorded(options, tube, geometry, pilot, session, parameters, folder, manifest)
+        report = _fly_recorded(Flight(options, conduit, pilot, weather, session, rendezvous, folder))
     if as_json:
         click.echo(json.dumps(report))
     else:
-        _summarise(report, pilot, tube, say)
+        _summarise(report, pilot, conduit, say)
     return bool(report["outcome"] == _word(Outcome.SUCCESS))
 
 
-def _fly_recorded(
-    options: FlightOptions,
-    tube: Tube,
-    geometry: MeshGeometry,
-    pilot: Pilot,
-    session: AgentSession,
-    parameters: dict[str, float],
-    folder: Path,
-    manifest: dict[str, Any],
-) -> dict[str, Any]:
+def _chosen_for_the_user(mesh: Path | None, choice: PilotChoice) -> Iterator[str]:
+    """Which of the shipped files are flown."""
+    if mesh == INDUSTRIAL:
+        yield f"mesh: {SHIPPED_MESH} is the shipped one"
+    if choice.path == SHIPPED_CHECKPOINT:
+        yield f"policy: {SHIPPED_POLICY} is the shipped one"
+
+
+def _label(options: FlightOptions, mesh: Path | None, choice: PilotChoice) -> str:
+    """Names of tube and pilot for a folder."""
+    tube = options.tube
+    flown = mesh.stem[:60] if mesh is not None else f"level{tube.level}-{tube.seed}" if tube else ""
+    return f"{flown}-{choice.label[:60]}-seed{options.start_seed}"
+
+
+def _forget_unflown(folder: Path) -> None:
+    """Remove the files of a generated tube where no flight began."""
+    if not (folder / MANIFEST).exists():
+        for name in TUBE_FILES:
+            (folder / name).unlink(missing_ok=True)
+
+
+def _fly_recorded(flight: Flight) -> dict[str, Any]:
     """Fly with a recording that is closed whatever happens, and return the report."""
+    options, pilot, session, folder = flight.options, flight.pilot, flight.session, flight.folder
+    names = [parameter.name for parameter in PARAMETERS]
+    defaults = dict(zip(names, session.description.defaults, strict=True))
+    geometry, parameters = flight.conduit.geometry, flight.weather.parameters
+    drawn = flight.weather.over(defaults)
     # Refuses a tube without room for the drone before anything is recorded.
-    build_resets(session.description, geometry, pilot.settings, [options.seed], parameters=parameters)
+    resets = build_resets(
+        session.description,
+        geometry,
+        pilot.settings,
+        [options.start_seed],
+        parameters=parameters,
+        drawn=drawn,
+    )
+    chosen = dict(zip(names, resets.parameters[0, : len(names)].tolist(), strict=True))
+    manifest = _manifest(flight, drawn, defaults, chosen)
     recorder = Recorder(folder, manifest, episode_dtype(pilot.settings.lidar.rays))
     status, report = "failed", dict[str, Any]()
     try:
         with LiveLine() as live:
-            session.register_tube(TUBE, _reference(tube))
+            session.register_tube(TUBE, flight.conduit.reference)
             observer = _Observer(recorder, live, options.realtime, pilot)
             result = fly(
                 session,
                 geometry,
-                pilot.controller,
+                pilot.make_controller(geometry),
                 pilot.settings,
-                seeds=[options.seed],
+                seeds=[options.start_seed],
                 tube=TUBE,
                 parameters=parameters,
+                drawn=drawn,
                 on_contact="end" if options.on_contact == "end" else "continue",
                 step_limit=options.max_steps,
                 on_step=observer,
@@ -190,7 +239,7 @@ def _report(result: FlightResult, recorder: Recorder, pilot: Pilot, observer: _O
     }
 
 
-def _summarise(report: dict[str, Any], pilot: Pilot, tube: Tube, say: Callable[[str], None]) -> None:
+def _summarise(report: dict[str, Any], pilot: Pilot, conduit: Conduit, say: Callable[[str], None]) -> None:
     """A short summary for people."""
     outcome = click.style(
         report["outcome"], fg="green" if report["outcome"] == "success" else "red", bold=True
@@ -201,7 +250,7 @@ def _summarise(report: dict[str, Any], pilot: Pilot, tube: Tube, say: Callable[[
     )
     say(
         f"  flown by {pilot.description['name']} ({pilot.description['sees']}), "
-        f"{100.0 * report['progress']:.1f} % of {tube.length:.1f} m, quality Q {report['quality']:.3f}"
+        f"{100.0 * report['progress']:.1f} % of {conduit.length:.1f} m, quality Q {report['quality']:.3f}"
     )
     say(
         f"  smallest gap between body and wall {report['min_clearance_m']:.3f} m, "
@@ -210,50 +259,42 @@ def _summarise(report: dict[str, Any], pilot: Pilot, tube: Tube, say: Callable[[
     say(f"  trajectory {report['trajectory_hash'][:16]}…, recorded in {report['run_dir']}")
 
 
-def _reference(tube: Tube) -> TubeReference:
-    return TubeReference(str(tube.path.resolve()), tube.axes, tube.scale, tube.sha256)
-
-
 def _manifest(
-    options: FlightOptions,
-    tube: Tube,
-    pilot: Pilot,
-    session: AgentSession,
-    parameters: dict[str, float],
-    rendezvous: str,
+    flight: Flight, drawn: Records, defaults: dict[str, float], chosen: dict[str, float]
 ) -> dict[str, Any]:
-    """What is known before the first step: enough to fly the same again."""
-    names = [parameter.name for parameter in PARAMETERS]
-    defaults = dict(zip(names, session.description.defaults, strict=True))
-    chosen = defaults | {"body_radius": pilot.settings.drone.body_radius} | parameters
+    """What is known before the first step: enough to fly the same again.
+
+    Args:
+        flight: what is flown.
+        drawn: (1,) conditions of the flight.
+        defaults: the plant's own parameters.
+        chosen: the parameters that are flown with.
+    """
+    options, pilot, session = flight.options, flight.pilot, flight.session
+    weather, length = flight.weather, flight.conduit.length
     return {
         "cosim": __version__,
         "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "options": {
-            name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()
-        },
-        "mesh": {
-            "path": str(tube.path),
-            "sha256": tube.sha256,
-            "axes": tube.axes,
-            "scale": tube.scale,
-            "centreline": str(tube.centreline_path),
-            "centreline_sha256": tube.centreline_sha256,
-            "length_m": tube.length,
-        },
+        "options": {name: str(v) if isinstance(v, Path) else v for name, v in asdict(options).items()}
+        | {"seed": options.start_seed},
+        **flight.conduit.description,
         "policy": pilot.description,
         "settings": asdict(pilot.settings),
+        "conditions": {
+            "chosen": {name: span for name, span in weather.ranges.ranges().items() if name in weather.named},
+            "drawn": {name: float(drawn[name][0]) for name in NAMES},
+            "noise_seed": int(drawn["seed"][0]),
+        },
         "session": {
-            "rendezvous": rendezvous,
+            "rendezvous": flight.rendezvous,
             "dt": session.dt,
             "physics_dt": session.physics_dt,
             "inner_steps": session.inner_steps,
-            "step_limit": options.max_steps or max_steps(pilot.settings, tube.length, session.dt),
+            "step_limit": options.max_steps or max_steps(pilot.settings, length, session.dt),
         },
         "plant": asdict(session.description) | {"defaults": defaults},
         "parameters": chosen,
         "physics_pid": session.peer_pid,
-        "versions": {name: metadata.version(name) for name in PACKAGES}
-        | {"python": platform.python_version()},
+        "versions": versions(),
         "platform": platform.platform(),
     }

@@ -8,18 +8,17 @@ and stand in a few lines below it; `--list-settings` says what each means.
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import click
 
 if TYPE_CHECKING:  # the tables are imported when a command needs them: `cosim --help` starts without numba
     from agent_client.conditions import Condition, Conditions, Range
     from agent_client.tubes import TubeRecipe
-
-WIDTH: Final = 108
 
 
 @dataclass(frozen=True)
@@ -179,12 +178,10 @@ class SettingsCommand(click.Command):
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Name the settings with unit and default."""
-        formatter.write_paragraph()
-        with formatter.indentation():
-            formatter.write_text(
-                "Named settings, each a value or a range low:high that every flight draws from:"
-            )
-            formatter.write_text(" ".join(f"{name}[{default}]" for name, default in _defaults()))
+        text = " ".join(f"{name}\u00a0[{default}]" for name, default in _defaults())
+        lines = textwrap.wrap(text, formatter.width - 2, break_on_hyphens=False)
+        formatter.write("\nNamed settings, each a value, or a range low:high that every flight draws from:\n")
+        formatter.write("".join(f"  {line}\n" for line in lines).replace("\u00a0", " "))
 
 
 def _defaults() -> list[tuple[str, str]]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import click
+
+from cosim.named_settings import NamedSettings
 
 SHIPPED_MESH: Final = "industrial.obj"
 SHIPPED_POLICY: Final = "tube_ppo"
@@ -18,18 +20,31 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True)
+class TubeChoice:
+    """A generated tube: the one that `cosim evaluate` draws for this level and seed."""
+
+    level: int
+    seed: int
+    length: float | None = None
+    """Of the axis over R, None for the recipe's."""
+
+
+@dataclass(frozen=True)
 class FlightOptions:
     """What the user asked of one flight; the fields are the options of `cosim launch`."""
 
-    mesh: str = SHIPPED_MESH
+    mesh: str | None = None
+    """None for the shipped conduit."""
+    tube: TubeChoice | None = None
     centerline: Path | None = None
     policy: str = SHIPPED_POLICY
     lookahead: float | None = None
+    speed: float | None = None
     dt: float | None = None
     physics_dt: float = DEFAULT_PHYSICS_DT
     allow_mismatch: tuple[str, ...] = ()
     max_steps: int | None = None
-    seed: int = 0
+    seed: int | None = None
     out: Path | None = None
     axes: str = "zup"
     scale: float = 1.0
@@ -37,12 +52,19 @@ class FlightOptions:
     realtime: float | None = None
     on_contact: str = "end"
     parameters: tuple[str, ...] = ()
-    compensation: float | None = None
+    settings: NamedSettings = field(default_factory=NamedSettings)
     server: str | None = None
     connect: str | None = None
     session: str | None = None
     transport: str = "shm"
     attach_timeout: float = DEFAULT_ATTACH_SECONDS
+
+    @property
+    def start_seed(self) -> int:
+        """The seed as given, else the tube's, else 0."""
+        if self.seed is not None:
+            return self.seed
+        return 0 if self.tube is None else self.tube.seed
 
 
 class Fraction(click.ParamType[float]):
@@ -62,6 +84,29 @@ class Fraction(click.ParamType[float]):
         return seconds
 
 
+class TubeType(click.ParamType[TubeChoice]):
+    """level=L,seed=N[,length=METRES over R]."""
+
+    name = "tube"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> TubeChoice:
+        """Read `level=2,seed=1234,length=40`."""
+        pairs = [part.partition("=") for part in str(value).split(",")]
+        given = {name.strip(): text for name, _, text in pairs}
+        try:
+            if len(given) != len(pairs) or not {"level", "seed"} <= set(given) <= {"level", "seed", "length"}:
+                raise ValueError
+            level, seed = int(given["level"]), int(given["seed"])
+            length = float(given["length"]) if "length" in given else None
+        except ValueError:
+            self.fail(f"expected level=L,seed=N[,length=R], found {value!r}", param, ctx)
+        if level not in (0, 1, 2):
+            self.fail(f"level: expected 0, 1 or 2, found {level}", param, ctx)
+        if not 0 <= seed < 2**63:
+            self.fail(f"seed: expected a whole number from 0 to 2^63 - 1, found {seed}", param, ctx)
+        return TubeChoice(level, seed, length)
+
+
 def _positive(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
     """Refuse zero, negative and non-finite values."""
     if value is not None and not 0.0 < value < float("inf"):
@@ -70,7 +115,9 @@ def _positive(ctx: click.Context, param: click.Parameter, value: float | None) -
 
 
 _FLIGHT: Final = (
-    click.option("--mesh", metavar="PATH", default=SHIPPED_MESH, show_default=True, help="Tube mesh."),
+    click.option("--mesh", metavar="PATH", help=f"Tube mesh [default: {SHIPPED_MESH}]."),
+    click.option("--tube", type=TubeType(), metavar="level=L,seed=N[,length=R]",
+                 help="A generated tube: that of `cosim evaluate`."),
     click.option("--centerline", type=click.Path(path_type=Path), metavar="PATH", default=None,
                  help="Centreline .obj [default: <mesh stem>_centerline.obj beside the mesh]."),
     click.option("--axes", type=click.Choice(["zup", "yup"]), default="zup", show_default=True,
@@ -79,9 +126,12 @@ _FLIGHT: Final = (
                  help="Metres in one unit of the files."),
     click.option("--start-end", type=click.Choice(["first", "last"]), default="first", show_default=True,
                  help="End of the centreline to start from."),
-    click.option("--policy", metavar="PATH|pure-pursuit", default=SHIPPED_POLICY, show_default=True,
-                 help="Checkpoint, or the baseline that knows the centreline."),
-    click.option("--lookahead", type=float, callback=_positive, metavar="M", help="Of Pure Pursuit (m)."),
+    click.option("--policy", metavar="PATH|pure-pursuit|lidar-rule", default=SHIPPED_POLICY, show_default=True,
+                 help="Checkpoint, or a baseline; Pure Pursuit knows the centreline."),
+    click.option("--lookahead", type=float, callback=_positive, metavar="M",
+                 help="Of Pure Pursuit (m) [default: 1]."),
+    click.option("--speed", type=float, callback=_positive, metavar="V",
+                 help="Of Pure Pursuit (m/s) [default: 2]."),
     click.option("--dt", type=Fraction(), help="Control step (s) [default: the checkpoint's]."),
     click.option("--physics-dt", type=Fraction(), default=DEFAULT_PHYSICS_DT, show_default=False,
                  help="Inner step (s); dt must be a whole multiple [default: 1/240]."),
@@ -89,13 +139,12 @@ _FLIGHT: Final = (
                  help="Fly although this differs from the checkpoint."),
     click.option("--max-steps", type=click.IntRange(min=1, max=10**9),
                  help="Step limit [default: 1.5 length / (slowest speed x dt)]."),
-    click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True,
-                 help="Of start offset, heading and gusts."),
+    click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=None, show_default=False,
+                 help="Of start, conditions, noise and gusts [default: 0, or the tube's]."),
     click.option("--on-contact", type=click.Choice(["end", "continue"]), default="end", show_default=True,
                  help="End at the first contact, or count on."),
     click.option("--parameter", "parameters", multiple=True, metavar="NAME=VALUE",
                  help="Plant parameter, e.g. force_gain=2."),
-    click.option("--compensation", type=float, metavar="C", help="Gravity compensation c, 1 hovers."),
     click.option("--realtime", type=float, callback=_positive, metavar="FACTOR",
                  help="Pace; 1 is wall clock [default: as fast as possible]."),
     click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [default: new]."),

@@ -6,18 +6,19 @@ import hashlib
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import agent_client
 from agent_client.contract import Contract, require_match, running_contract
 from agent_client.controllers import DEFAULT_LOOKAHEAD, PolicyController, PurePursuit
 from agent_client.errors import ContractMismatch
-from agent_client.evaluation import MakeController
-from agent_client.lidar_rule import ASYMMETRIES, LidarRule
 from agent_client.policy import load_policy
 from agent_client.settings import DEFAULT_DT, Settings
 from cosim.errors import CosimError
 from cosim.options import SHIPPED_POLICY
+
+if TYPE_CHECKING:
+    from agent_client.evaluation import MakeController
 
 PURE_PURSUIT: Final = "pure-pursuit"
 TUNED_PURSUIT: Final = "pure-pursuit-tuned"
@@ -69,6 +70,10 @@ class Terms:
     """Fields of DroneSettings; naming one is allowing it."""
 
 
+ANY_DRONE: Final = ("drone.body_radius", "drone.compensation")
+"""Terms of the contract that an evaluation sets by its conditions, for every pilot alike."""
+
+
 def choose_pilot(name: str, lookahead: float | None = None, speed: float | None = None) -> PilotChoice:
     """Who is meant by --policy.
 
@@ -117,6 +122,8 @@ def read_pilot(choice: PilotChoice, terms: Terms | None = None) -> Pilot:
         return _read_checkpoint(choice.name, choice.path, base, terms)
     dt = DEFAULT_DT if terms.dt is None else terms.dt
     if choice.name == LIDAR_RULE:
+        from agent_client.lidar_rule import ASYMMETRIES, LidarRule  # not on the way of other flights' start
+
         sees = f"LiDAR alone ({', '.join(ASYMMETRIES)}), no centreline"
         return Pilot(lambda _: LidarRule(base), base, dt, {"name": LIDAR_RULE, "sees": sees}, ())
     if choice.name == TUNED_PURSUIT and choice.lookahead is None:

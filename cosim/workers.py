@@ -30,7 +30,7 @@ from agent_client.tubes import TubeRecipe
 from agent_client.tuning import Tuning, tune_pure_pursuit
 from cosim.errors import PEER, TERMINATED, WorkerError, exit_status
 from cosim.options import DEFAULT_PHYSICS_DT
-from cosim.pilots import Pilot, PilotChoice, read_pilot
+from cosim.pilots import ANY_DRONE, Pilot, PilotChoice, Terms, read_pilot
 from cosim.sessions import server_session
 from cosim.walls import WallRegistry
 from physics_server.reference import ReferencePlant
@@ -183,7 +183,7 @@ def _tune(job: TuneJob) -> Tuning:
 
 @lru_cache(maxsize=32)
 def _pilot(choice: PilotChoice) -> Pilot:
-    return read_pilot(choice)
+    return read_pilot(choice, Terms(allowed=ANY_DRONE))
 
 
 @contextmanager
