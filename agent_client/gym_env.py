@@ -17,7 +17,6 @@ reward_terms    the reward's terms by their names (`agent_client.reward.TERMS`)
 from __future__ import annotations
 
 import math
-import os
 import weakref
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
@@ -308,13 +307,7 @@ def _hold(
     """Enter a session; what leaves it is called at the latest when `owner` is collected or the program ends."""
     stack = ExitStack()
     session = stack.enter_context(opened)
-    return session, weakref.finalize(owner, _leave, stack, os.getpid())
-
-
-def _leave(stack: ExitStack, opener: int) -> None:
-    """Close a session in the process that opened it; a copy of that process by fork leaves it alone."""
-    if os.getpid() == opener:
-        stack.close()
+    return session, weakref.finalize(owner, stack.close)
 
 
 def _check_open(close: weakref.finalize[..., Any]) -> None:
