@@ -71,7 +71,7 @@ def test_a_policy_sees_the_observation_and_its_actions_become_commands(
     step = first_look(tube, poses_at([[5.0, 0.0, 0.0]] * 2, [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
     commands, actions = CommandBatch.zeros(2), np.zeros(2, dtype=np.int64)
     PolicyController(Fixed(), Settings()).act(step, commands, actions)
-    assert seen[0] is step.observation
+    np.testing.assert_array_equal(seen[0], step.observation)
     np.testing.assert_array_equal(actions, [2, 7])
     np.testing.assert_allclose(commands.direction[0], [1.0, 0.0, 0.0], atol=1e-15)  # straight
     right = action_table(Settings()).alpha[7]
@@ -79,3 +79,28 @@ def test_a_policy_sees_the_observation_and_its_actions_become_commands(
         commands.direction[1], [math.sin(right), math.cos(right), 0.0], atol=1e-12
     )
     np.testing.assert_array_equal(commands.speed, [1.5, 2.0])
+
+
+def test_a_policy_with_a_history_sees_its_lags_side_by_side(cylinder: Maker, poses_at: Maker) -> None:
+    """Blocks of 37, newest first; the first observation stands in for what was before it."""
+    seen = []
+
+    class Straight:
+        def act(self, observations: np.ndarray) -> np.ndarray:
+            seen.append(observations.copy())
+            return np.zeros(len(observations), dtype=np.int64)
+
+    tube = cylinder()
+    task = TubeTask(tube, Settings(), 0.1, clearance_contact=True)
+    controller = PolicyController(Straight(), Settings(), (0, 2))
+    commands, actions = CommandBatch.zeros(1), np.zeros(1, dtype=np.int64)
+    observations = []
+    for k in range(5):
+        poses = poses_at([1.0 + 0.1 * k, 0.1 * k, 0.0])
+        step = task.observe(poses) if k else task.begin(np.arange(1), poses)
+        observations.append(step.observation[0].copy())
+        controller.act(step, commands, actions)
+    for k in range(5):
+        np.testing.assert_array_equal(
+            seen[k][0], np.concatenate([observations[k], observations[max(k - 2, 0)]])
+        )

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from agent_client.conditions import HARD, Conditions, draw_conditions
 from agent_client.controllers import CONTINUOUS, Controller, PolicyController, PurePursuit
 from agent_client.flight import PHASES, FlightResult, FlightStep, fly
 from agent_client.kinematic import KinematicPlant
+from agent_client.lidar_rule import LidarRule
 from agent_client.settings import ActionSettings, Settings, StartSettings
 from agent_client.task import Outcome, TaskStep
 from meshes.curves import generate_curve
@@ -193,6 +195,109 @@ def test_lanes_that_are_over_stand_still_until_the_last_one_ends(cylinder: Maker
     assert all(a["reward"][0] == 0.0 for a in after)
     assert all(a["command"][1, 3] == 2.0 for a in after)
     assert result.progress[0] == pytest.approx(0.9, abs=0.05)
+
+
+def test_lanes_that_are_over_stand_still_whatever_is_on_its_way_to_them(cylinder: Maker) -> None:
+    """Neither commands that a delay still holds back nor the air near the wall move them."""
+    tube, seen = cylinder(lanes=2), Seen()
+    tube.length[0] = 5.0
+    drawn = draw_conditions(Conditions(action_delay=(3, 3), near_wall=(0.5, 0.5)), [(1,), (2,)])
+    result = flight(tube, PurePursuit(tube, Settings()), drawn=drawn, on_step=seen)
+    assert result.outcome == (Outcome.SUCCESS,) * 2
+    assert result.steps[0] + 3 < result.steps[1]
+    before, after = seen.arrays[result.steps[0]], seen.arrays[result.steps[0] + 1 :]
+    assert before["command"][0, 3] > 0.0
+    assert all(a["command"][0, 3] == 0.0 for a in after)
+    assert all(a["command"][1, 3] > 0.0 for a in after)
+
+
+def test_a_decision_arrives_when_its_delay_has_passed(cylinder: Maker) -> None:
+    """Lanes of delays 0, 1 and 4: the command of step k was decided at k - delay; before it, none to move."""
+
+    class Counting(Controller):
+        decided = 0
+
+        def act(self, step: TaskStep, commands: CommandBatch, actions: np.ndarray) -> None:
+            self.decided += 1
+            commands.direction[:], commands.speed[:] = [1.0, 0.0, 0.0], 0.01 * self.decided
+
+    drawn = draw_conditions(Conditions(), [(1,)] * 3)
+    drawn["action_delay"] = [0, 1, 4]
+    seen = Seen()
+    flight(cylinder(lanes=3), Counting(), drawn=drawn, on_step=seen, step_limit=12)
+    speeds = np.array([a["command"][:, 3] for a in seen.arrays[1:]])
+    steps = np.arange(1, 13)
+    for lane, delay in enumerate([0, 1, 4]):
+        np.testing.assert_allclose(speeds[:, lane], 0.01 * np.maximum(steps - delay, 0), atol=1e-15)
+
+
+def test_every_command_carries_the_compensation_of_its_episode(cylinder: Maker) -> None:
+    """As drawn, and that of the settings where nothing was drawn."""
+    drawn = draw_conditions(Conditions(compensation=(0.8, 1.05)), [(1,), (2,)])
+    tube = cylinder(lanes=2)
+    for conditions, expected in ((drawn, drawn["compensation"]), (None, [0.9, 0.9])):
+        seen = Seen()
+        flight(tube, PurePursuit(tube, Settings()), drawn=conditions, on_step=seen)
+        assert all((a["command"][:, 4] == expected).all() for a in seen.arrays[1:])
+
+
+BLIND = HARD.with_ranges(
+    {"lidar_noise": (0.3, 0.3), "lidar_dropout": (0.5, 0.5), "observation_delay": (5, 5)}
+)
+"""Sensors that are of little use."""
+
+
+def commands_of(geometry: Any, controller: Controller, conditions: Conditions) -> np.ndarray:
+    """What a flight of one lane commanded."""
+    seen = Seen()
+    flight(geometry, controller, drawn=draw_conditions(conditions, [(3,)]), on_step=seen)
+    return np.array([a["command"] for a in seen.arrays])
+
+
+def test_sensors_do_not_touch_pure_pursuit(cylinder: Maker) -> None:
+    """It knows the axis and its place: with and without noise and delay of the sensors it flies the same."""
+    tube = cylinder()
+    clear = BLIND.with_ranges(
+        {"lidar_noise": (0.0, 0.0), "lidar_dropout": (0.0, 0.0), "observation_delay": (0, 0)}
+    )
+    there = commands_of(tube, PurePursuit(tube, Settings()), BLIND)
+    np.testing.assert_array_equal(there, commands_of(tube, PurePursuit(tube, Settings()), clear))
+    late = commands_of(tube, PurePursuit(tube, Settings()), clear.with_ranges({"action_delay": (2, 2)}))
+    assert not np.array_equal(there[:20], late[:20])
+
+
+@pytest.mark.parametrize("name", ["lidar_noise", "lidar_dropout", "observation_delay"])
+def test_sensors_touch_the_lidar_rule(cylinder: Maker, name: str) -> None:
+    """Noise, drop-outs and the observation's delay each change what it commands."""
+    settings = Settings()
+    still = commands_of(cylinder(), LidarRule(settings), Conditions())
+    disturbed = Conditions().with_ranges({name: BLIND.ranges()[name]})
+    there = commands_of(cylinder(), LidarRule(settings), disturbed)
+    assert not np.array_equal(there[:15], still[:15])
+
+
+def test_a_policy_sees_what_is_as_old_as_the_delay(cylinder: Maker) -> None:
+    """What it is given at step k is the observation of step k - 3, and until there is one, the first."""
+    given: list[np.ndarray] = []
+
+    class Straight:
+        def act(self, observations: np.ndarray) -> np.ndarray:
+            given.append(observations.copy())
+            return np.full(len(observations), 3)
+
+    settings, seen = Settings(), Seen()
+    drawn = draw_conditions(Conditions(observation_delay=(3, 3)), [(1,), (2,)])
+    flight(
+        cylinder(lanes=2),
+        PolicyController(Straight(), settings),
+        settings,
+        drawn=drawn,
+        on_step=seen,
+        step_limit=10,
+    )
+    assert len(given) == 10
+    for step, observation in enumerate(given):
+        np.testing.assert_array_equal(observation, seen.arrays[max(step - 3, 0)]["observation"])
 
 
 def test_a_flight_into_the_wall_is_a_collision_unless_contacts_may_continue(cylinder: Maker) -> None:

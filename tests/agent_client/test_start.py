@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from agent_client.conditions import Conditions, draw_conditions
 from agent_client.errors import SettingsError
 from agent_client.kinematic import KinematicPlant
 from agent_client.settings import DroneSettings, Settings
@@ -62,6 +63,32 @@ def test_resets_carry_defaults_overrides_and_the_body_radius(cylinder: Maker) ->
     assert (resets.tube[0], resets.seed[0], resets.selected[0]) == (3, 42, 1)
 
 
+def test_drawn_conditions_take_the_place_of_parameters_and_leave_the_start_alone(cylinder: Maker) -> None:
+    """Each lane has its own gain, mass, body and seed of the gusts; what is no condition stays as asked for."""
+    drawn = draw_conditions(
+        Conditions(gain=(1.5, 6.0), mass=(0.5, 2.0), body_radius=(0.1, 0.2), along_body=(0, 1)),
+        [(1,), (2,), (3,)],
+    )
+    plain = build_resets(
+        DESCRIPTION, cylinder(lanes=3), Settings(), [5, 6, 7], parameters={"torque_kp": 100.0}
+    )
+    resets = build_resets(
+        DESCRIPTION,
+        cylinder(lanes=3),
+        Settings(),
+        [5, 6, 7],
+        parameters={"force_gain": 4.0, "torque_kp": 100.0},
+        drawn=drawn,
+    )
+    for parameter, name in (
+        ("force_gain", "gain"), ("mass", "mass"), ("body_radius", "body_radius"), ("force_along_body", "along_body"),
+    ):  # fmt: skip
+        np.testing.assert_array_equal(resets.parameters[:, PARAMETER_INDEX[parameter]], drawn[name])
+    assert (resets.parameters[:, PARAMETER_INDEX["torque_kp"]] == 100.0).all()
+    np.testing.assert_array_equal(resets.seed, drawn["seed"].astype(np.int64))
+    np.testing.assert_array_equal(resets.raw[:, :13], plain.raw[:, :13])
+
+
 def test_drawing_selects_exactly_the_lanes_that_were_asked_for(cylinder: Maker) -> None:
     """Other rows keep their poses and are not selected."""
     resets = ResetBatch.zeros(4)
@@ -98,6 +125,10 @@ def test_a_tube_that_the_body_does_not_fit_into_is_refused(cylinder: Maker) -> N
         build_resets(DESCRIPTION, cylinder(radius=0.01), Settings(), [0])
     with pytest.raises(SettingsError, match=r"not above the body's radius 1\.2 m"):
         build_resets(DESCRIPTION, cylinder(), Settings(), [0], parameters={"body_radius": 1.2})
+    drawn = draw_conditions(Conditions(), [(1,), (2,)])
+    drawn["body_radius"][1] = 1.0
+    with pytest.raises(SettingsError, match=r"lane 1: R 1 m at the start is not above the body's radius 1 m"):
+        build_resets(DESCRIPTION, cylinder(lanes=2), Settings(), [0, 1], drawn=drawn)
 
 
 def test_wrong_names_and_counts_are_refused(cylinder: Maker) -> None:
