@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from agent_client.conditions import DELAY_MAX
+from agent_client.errors import SettingsError
 from agent_client.features import FEATURES
 from agent_client.task import TaskStep
 
@@ -30,9 +31,14 @@ class ObservationHistory:
         lanes: N.
         lags: ages of the stacked observations in control steps, newest first. Before an episode is as old as a
             lag, its first observation stands in.
+
+    Raises:
+        SettingsError: no lags, or one that is negative or above LAG_MAX.
     """
 
     def __init__(self, lanes: int, lags: Sequence[int] = PRESENT) -> None:
+        if not lags or min(lags) < 0 or max(lags) > LAG_MAX:
+            raise SettingsError(f"lags: expected ages from 0 to {LAG_MAX} steps, found {tuple(lags)}")
         self.lanes: Final = lanes
         self._lags: Ints = np.array(lags, dtype=np.int64)
         self._ring: Singles = np.zeros((max(lags) + DELAY_MAX + 1, lanes, len(FEATURES)), np.float32)

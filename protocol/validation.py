@@ -23,6 +23,16 @@ COMPENSATION_MAX: Final = 2.0
 _ROW: Final = struct.Struct("<5d3q")
 assert _ROW.size == COMMAND_STRIDE
 
+_STATE_WORDS: Final = 13
+"""Words of position, quaternion and velocities at the beginning of a reset row."""
+_LARGEST: Final = np.finfo(np.float64).max
+_LOWEST: Final = np.array(
+    [np.nextafter(p.lowest, math.inf) if p.above_lowest else max(p.lowest, -_LARGEST) for p in PARAMETERS]
+)
+_HIGHEST: Final = np.array([min(p.highest, _LARGEST) for p in PARAMETERS])
+"""Smallest and largest numbers that a parameter may be, finite as they must be."""
+_EITHER: Final = [i for i, p in enumerate(PARAMETERS) if p.either]
+
 
 def command_check(commands: CommandBatch, speed_max: float) -> Callable[[], bool]:
     """Make the quick check of a session's one batch of commands: whether all of it may be integrated.
@@ -74,6 +84,8 @@ def command_refusal(commands: CommandBatch, speed_max: float) -> Refusal | None:
 
 def reset_refusal(resets: ResetBatch, tubes: Container[int]) -> Refusal | None:
     """Return what is wrong with the first unsound row among the selected ones; `tubes` are the registered indices."""
+    if resets_are_sound(resets, tubes):
+        return None
     for lane, selected in enumerate(resets.selected.tolist()):
         if selected not in (0, 1):
             return Refusal("selected", "0 or 1", str(selected), lane, RefusalCode.OUT_OF_RANGE)
@@ -81,6 +93,23 @@ def reset_refusal(resets: ResetBatch, tubes: Container[int]) -> Refusal | None:
         if refusal is not None:
             return refusal
     return None
+
+
+def resets_are_sound(resets: ResetBatch, tubes: Container[int]) -> bool:
+    """The quick check of all selected rows at once, which takes as long as that of one row by itself."""
+    chosen = resets.selected == 1
+    rows = ResetBatch(resets.raw[chosen])
+    parameters = rows.parameters[:, : len(PARAMETERS)]
+    squared = np.einsum("ij,ij->i", rows.quaternion, rows.quaternion)
+    return bool(
+        (chosen | (resets.selected == 0)).all()
+        and np.isfinite(rows.raw[:, :_STATE_WORDS]).all()
+        and (np.abs(squared - 1.0) <= UNIT_TOLERANCE).all()
+        and ((parameters >= _LOWEST) & (parameters <= _HIGHEST)).all()
+        and all(np.isin(parameters[:, i], PARAMETERS[i].either).all() for i in _EITHER)
+        and not np.count_nonzero(rows.parameters.view(np.int64)[:, len(PARAMETERS) :])
+        and all(tube == NO_TUBE or tube in tubes for tube in rows.tube.tolist())
+    )
 
 
 def _reset_row_refusal(resets: ResetBatch, lane: int, tubes: Container[int]) -> Refusal | None:

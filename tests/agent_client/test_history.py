@@ -7,8 +7,9 @@ import pytest
 
 from agent_client.conditions import DELAY_MAX
 from agent_client.episodes import episode_dtype
+from agent_client.errors import SettingsError
 from agent_client.features import FEATURES
-from agent_client.history import ObservationHistory
+from agent_client.history import LAG_MAX, ObservationHistory
 from agent_client.task import TaskStep
 
 LANES, WIDTH = 4, len(FEATURES)
@@ -67,3 +68,10 @@ def test_following_a_task_is_beginning_and_pushing() -> None:
         told.begin(np.flatnonzero(fresh), numbered(now), delays)
         follows.follow(step)
         np.testing.assert_array_equal(follows.stack(), told.stack())
+
+
+@pytest.mark.parametrize("lags", [(), (0, -1), (0, LAG_MAX + 1)])
+def test_lags_that_make_no_sense_are_refused(lags: tuple[int, ...]) -> None:
+    """None at all, the future, or longer ago than anybody remembers."""
+    with pytest.raises(SettingsError, match="lags"):
+        ObservationHistory(LANES, lags)
