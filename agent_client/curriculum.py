@@ -47,6 +47,17 @@ class Curriculum:
         """Success rate over the last `window` episodes at the current level; NaN before the first."""
         return sum(self._results) / len(self._results) if self._results else math.nan
 
+    @property
+    def results(self) -> list[bool]:
+        """The episodes that the success rate is taken over, oldest first."""
+        return list(self._results)
+
+    def restore(self, level: int, results: Sequence[bool], passed: bool) -> None:
+        """Go on where another curriculum stood."""
+        self.level, self.passed = level, passed
+        self._results.clear()
+        self._results.extend(results)
+
     def draw(self, rng: np.random.Generator) -> int:
         """Draw the level of the next episode."""
         if self.level > 0 and self.replay > 0.0 and rng.random() < self.replay:

@@ -12,14 +12,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agent_client.actions import action_table
 from agent_client.task import Outcome
+from agent_client.training_options import REWARD_SCALE
 from agent_client.world import TubeWorld, WorldStep
 
 Singles = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-
-REWARD_SCALE: Final = 0.02
-"""Factor of the rewards that the learner sees, for the value loss; episode returns are not scaled."""
 
 
 class TubeVecEnv(VecEnv):

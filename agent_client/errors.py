@@ -2,6 +2,7 @@
 
 AgentError
 ├── SettingsError          a setting is out of range, or two settings contradict each other
+├── TrainingError          a training that cannot be gone on with, or whose log cannot be read
 └── PolicyError            a checkpoint that is missing, empty, foreign, or of other spaces
     └── ContractMismatch   a checkpoint that was made for other sensors, actions or time step than run now
 """
@@ -18,6 +19,10 @@ class AgentError(Exception):
 
 class SettingsError(AgentError):
     """A setting that cannot be used; the message names it, what was expected and what was found."""
+
+
+class TrainingError(AgentError):
+    """A training's files that do not fit; the message names the file and what to do."""
 
 
 class PolicyError(AgentError):

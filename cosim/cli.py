@@ -66,23 +66,67 @@ def export(run: Path, kind: str, output: Path | None) -> None:
     click.echo(write(run, kind, output))
 
 
-@cosim.command(short_help="Train a policy with PPO in the kinematic world.")
-@click.option("--preset", type=click.Choice(["shipped", "paper"]), default="shipped", show_default=True)
+@cosim.command(short_help="Train a policy with PPO.")
+@click.option("--preset", type=click.Choice(["paper", "quick", "robust"]), help="Recipe [default: robust].")
 @click.option(
     "--steps", type=click.IntRange(min=1), help="Control steps of all drones [default: the preset's]."
 )
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True)
-@click.option("--envs", type=click.IntRange(min=1), default=65, show_default=True, help="Drones at a time.")
-@click.option("--out", type=click.Path(path_type=Path), default=Path("runs/training"), show_default=True)
-def train(preset: str, steps: int | None, seed: int, envs: int, out: Path) -> None:
-    """Train a policy with PPO in the kinematic world, through the curriculum of the paper.
+@click.option(
+    "--seed", type=click.IntRange(0, 2**32 - 1), help="Of tubes, starts, network [default: the preset's]."
+)
+@click.option("--envs", type=click.IntRange(min=1), help="Drones side by side [default: 65].")
+@click.option("--pool", type=click.IntRange(min=1), help="Tubes a level [default: 1000; fewer with bullet].")
+@click.option(
+    "--dynamics", type=click.Choice(["kinematic", "rigid-body"]), help="World [default: the preset's]."
+)
+@click.option(
+    "--engine", type=click.Choice(["reference", "bullet"]), help="Of rigid bodies [default: reference]."
+)
+@click.option(
+    "--resume", type=click.Path(path_type=Path), metavar="DIR", help="Go on with the training in DIR."
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder [default: runs/training]."
+)
+@click.option(
+    "--explain", is_flag=True, help="Print what the paper leaves open and what 'paper' takes; train nothing."
+)
+def train(out: Path | None, resume: Path | None, explain: bool, **arguments: Any) -> None:
+    """Train a policy with PPO, through the curriculum of the paper, and write it as a checkpoint that flies.
 
     \b
-    cosim train --preset shipped --seed 1 --out runs/mine
+    paper    the paper's task, features, literal reward and hyperparameters
+    quick    above the paper's success rates in the least time
+    robust   the shipped policy's: inertia, noise, hard tubes
+
+    The folder gets policy.zip, policy.csv (a row an iteration), TensorBoard's logs, success.png and return.png.
+    A training that was stopped or killed goes on after its last iteration, with new episodes:
+
+    \b
+    cosim train --preset quick --seed 1 --out runs/mine
+    cosim train --resume runs/mine
     """
+    from cosim.train import TrainArguments, print_choices
     from cosim.train import train as run
 
-    run(preset, steps, seed, envs, out)
+    if explain:
+        print_choices(arguments["preset"])
+    else:
+        run(TrainArguments(**arguments), out, resume)
+
+
+@cosim.command(short_help="Draw success rate and return of a training by iteration.")
+@click.argument("folder", type=click.Path(path_type=Path), metavar="DIR")
+def figures(folder: Path) -> None:
+    """Draw the paper's two figures of a training, also of one that still runs: success.png and return.png in DIR.
+
+    \b
+    cosim figures runs/mine
+    """
+    from cosim.figures import draw_figures
+
+    for path in draw_figures(folder / "policy.csv", folder):
+        click.echo(path)
 
 
 @cosim.command(cls=SettingsCommand, short_help="Fly pilots through many unseen tubes, beside the paper's figures.")

@@ -1,84 +1,239 @@
-"""`cosim train`: PPO in the kinematic world, with a live line and a checkpoint that can be flown."""
+"""`cosim train`: PPO by a preset, with a live display, a log, and checkpoints that a kill does not cost."""
 
 from __future__ import annotations
 
-import math
-import sys
+import json
+import os
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from cosim.errors import CosimError, OutputError
+from cosim.errors import CosimError, OutputError, Terminated
+from cosim.figures import draw_figures
+from cosim.sessions import server_session
+from cosim.train_display import TrainingDisplay
+from cosim.walls import WallRegistry, wall_slots
+from physics_server.reference import ReferencePlant
+from protocol.agent import AgentSession, SessionSettings
+from protocol.twin import open_twin
+
+if TYPE_CHECKING:  # torch is loaded only when training begins
+    from agent_client.training_options import TrainingOptions
 
 CHECKPOINT: Final = "policy.zip"
+ARGUMENTS: Final = "training.json"
+"""The arguments of the command, kept for `--resume`."""
+
+LEVELS: Final = 3
 
 
-def train(preset: str, steps: int | None, seed: int, envs: int, out: Path) -> None:
-    """Train, and write the checkpoint to `out`/policy.zip.
+@dataclass(frozen=True)
+class TrainArguments:
+    """What the user asked of a training; None leaves it to the preset."""
+
+    preset: str | None = None
+    steps: int | None = None
+    seed: int | None = None
+    envs: int | None = None
+    pool: int | None = None
+    dynamics: str | None = None
+    engine: str | None = None
+
+
+def train(arguments: TrainArguments, out: Path | None, resume: Path | None) -> None:
+    """Train, or go on training, in a folder: checkpoint, state, log, TensorBoard's logs and the two figures.
 
     Args:
-        preset: "paper" for the paper's tubes and all of its features; "shipped" for the recipe of the shipped
-            policy, which sees neither its place in the tube nor its progress.
-        steps: control steps of all drones together, None for the preset's.
-        seed: of tubes, starts and network.
-        envs: drones side by side.
-        out: folder of the checkpoint and of TensorBoard's logs.
+        arguments: what was asked; with `resume` only `steps` may be given.
+        out: folder of a new training, None for runs/training.
+        resume: folder of a training to go on with.
 
     Raises:
-        CosimError: the extra `train` is not installed.
-        OutputError: the folder cannot be written.
+        CosimError: arguments that contradict each other, or the extra `train` is not installed.
+        OutputError: the folder cannot be written, or holds a training already.
+        AgentError: there is nothing to resume, or a value out of range.
     """
+    if resume is not None:
+        if out is not None:
+            raise CosimError("--resume: a training goes on in its own folder; leave out --out")
+        folder, arguments = resume, _resumed(resume, arguments)
+    else:
+        folder = out or Path("runs/training")
+        _refuse_training(folder)
+        arguments = _completed(arguments)
+    run = _training()
+    if resume is None:
+        _begin_folder(folder, arguments)
+    options = _options(folder, arguments)
+    click.echo(_announcement(options, arguments, resumed=resume is not None), err=True)
+    checkpoint = options.out
     try:
-        from dataclasses import replace
+        with TrainingDisplay(options.preset, options.steps) as display:
+            written = run(
+                options,
+                display.update,
+                _opener(arguments),
+                **_walls(options, arguments),
+                resume=resume is not None,
+            )
+    except (KeyboardInterrupt, Terminated):
+        if checkpoint.with_suffix(".state").exists():
+            text = f"training stopped; {checkpoint} is its last iteration; go on with: cosim train --resume {folder}"
+        else:
+            text = "training stopped before its first iteration was completed; nothing was kept"
+        click.echo(text, err=True)
+        raise
+    for figure in draw_figures(checkpoint.with_suffix(".csv"), folder):
+        click.echo(figure, err=True)
+    click.echo(written)
 
-        from agent_client.training import Progress, TrainingOptions, shipped_options
+
+def limit_spinning() -> None:
+    """Have torch's threads wait for each other asleep, unless the user says otherwise; call before torch is loaded.
+
+    By default they spin, which on a machine with other work takes 15 times as long.
+    """
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+
+
+def print_choices(preset: str | None) -> None:
+    """Print what the paper leaves open and what the preset `paper` takes.
+
+    Raises:
+        CosimError: another preset, which goes beyond the paper.
+    """
+    if preset not in (None, "paper"):
+        raise CosimError(f"--explain: expected --preset paper, found {preset}, which is not the paper's")
+    from agent_client.paper import to_markdown
+
+    click.echo(to_markdown())
+
+
+def _training() -> Callable[..., Path]:
+    limit_spinning()
+    try:
         from agent_client.training import train as run
     except ImportError as error:
         raise CosimError(
             f"training needs {error.name}; install the extra with: pip install 'tube-cosim[train]'"
         ) from error
+    return run
 
-    path = out / CHECKPOINT
-    if path.exists():
-        raise OutputError(
-            f"--out {out}: expected a folder without a policy, found {path}; name another folder"
+
+def _completed(arguments: TrainArguments) -> TrainArguments:
+    """The arguments with the dynamics and the engine that are left to the preset.
+
+    Raises:
+        CosimError: an engine without inertia.
+    """
+    from agent_client.presets import PRESETS
+
+    preset = arguments.preset or "robust"
+    dynamics = arguments.dynamics or PRESETS[preset].dynamics
+    if dynamics == "kinematic" and arguments.engine is not None:
+        raise CosimError(
+            f"--engine {arguments.engine}: kinematic dynamics have no engine; add --dynamics rigid-body"
         )
+    engine = (arguments.engine or "reference") if dynamics == "rigid-body" else None
+    return replace(arguments, preset=preset, dynamics=dynamics, engine=engine)
+
+
+def _resumed(folder: Path, given: TrainArguments) -> TrainArguments:
+    """The arguments that a training was begun with, and the new number of steps if one is given.
+
+    Raises:
+        CosimError: the folder holds no training, or an argument is given that cannot change.
+    """
+    path = folder / ARGUMENTS
     try:
-        out.mkdir(parents=True, exist_ok=True)
+        begun = TrainArguments(**json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError) as error:
+        raise CosimError(
+            f"--resume {folder}: expected the folder of a training, found no {ARGUMENTS} that can be read ({error})"
+        ) from error
+    for field in fields(TrainArguments):
+        value, before = getattr(given, field.name), getattr(begun, field.name)
+        if field.name != "steps" and value not in (None, before):
+            raise CosimError(
+                f"--{field.name} {value}: expected that of the training that goes on, {before}; leave it out"
+            )
+    return begun if given.steps is None else replace(begun, steps=given.steps)
+
+
+def _refuse_training(folder: Path) -> None:
+    """Refuse a folder for a new training that holds one already.
+
+    Raises:
+        OutputError: it does.
+    """
+    for name in (CHECKPOINT, ARGUMENTS):
+        if (folder / name).exists():
+            raise OutputError(
+                f"--out {folder}: expected a folder without a training, found {name}; name another folder, or go "
+                f"on with --resume {folder}"
+            )
+
+
+def _begin_folder(folder: Path, arguments: TrainArguments) -> None:
+    """Make the folder of a new training and keep its arguments there.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / ARGUMENTS).write_text(json.dumps(asdict(arguments), indent=1) + "\n")
     except OSError as error:
-        raise OutputError(f"--out {out}: cannot be created: {error.strerror}") from error
-    if preset == "paper":
-        options = TrainingOptions(path, seed=seed, preset=preset)
-    else:
-        options = shipped_options(path, seed=seed)
-    options = replace(
+        raise OutputError(f"--out {folder}: cannot be written: {error.strerror}") from error
+
+
+def _options(folder: Path, arguments: TrainArguments) -> TrainingOptions:
+    """The preset's options with what the user asked."""
+    from agent_client.presets import PRESETS
+
+    assert arguments.preset is not None
+    options = PRESETS[arguments.preset].options
+    lanes = arguments.envs or options.hyperparameters.lanes
+    # PyBullet reads a wall in 0.1 s: with pools no larger than what stays registered, it reads each one once.
+    pool = wall_slots(lanes) // LEVELS if arguments.engine == "bullet" else options.pool
+    return replace(
         options,
-        steps=steps or options.steps,
-        hyperparameters=replace(options.hyperparameters, lanes=envs),
-        tensorboard=out / "tensorboard",
+        out=folder / CHECKPOINT,
+        steps=arguments.steps or options.steps,
+        seed=options.seed if arguments.seed is None else arguments.seed,
+        pool=arguments.pool or pool,
+        hyperparameters=replace(options.hyperparameters, lanes=lanes),
+        tensorboard=folder / "tensorboard",
     )
-    live = sys.stderr is not None and sys.stderr.isatty()
 
-    def show(progress: Progress) -> None:
-        rate = "   -" if math.isnan(progress.success_rate) else f"{100.0 * progress.success_rate:4.0f}"
-        line = (
-            f"level {progress.level}  success {rate} %  return {progress.mean_return:7.1f}  "
-            f"{progress.steps:,} of {progress.total_steps:,} steps  {progress.steps_per_second:6.0f} steps/s  "
-            f"{progress.seconds_left:4.0f} s left"
-        )
-        # On a terminal one line that is drawn anew; elsewhere a line a batch.
-        click.echo(f"\r{line}\033[K" if live else line, err=True, nl=not live)
 
-    click.echo(
-        f"training '{preset}' for {options.steps:,} steps; drawing tubes and compiling first", err=True
+def _announcement(options: TrainingOptions, arguments: TrainArguments, *, resumed: bool) -> str:
+    engine = f" integrated by {arguments.engine}" if arguments.engine else ""
+    anew = "; episodes that were under way begin anew" if resumed else ""
+    return (
+        f"{'resuming' if resumed else 'training'} '{options.preset}' to {options.steps:,} steps, seed "
+        f"{options.seed}: {options.hyperparameters.lanes} drones, {arguments.dynamics} dynamics{engine}, pools of "
+        f"{options.pool:,} tubes a level{anew}"
     )
-    try:
-        written = run(options, show)
-    except BaseException:
-        kept = f"its last checkpoint is {path}" if path.exists() else "no checkpoint was written yet"
-        click.echo(f"\ntraining ended early; {kept}", err=True)
-        raise
-    if live:
-        click.echo(err=True)
-    click.echo(f"{written}")
+
+
+def _opener(
+    arguments: TrainArguments,
+) -> Callable[[SessionSettings], AbstractContextManager[AgentSession]] | None:
+    """What opens the session of the dynamics; None for training's own kinematic world."""
+    if arguments.engine == "reference":
+        return lambda settings: open_twin(ReferencePlant(), settings)
+    if arguments.engine == "bullet":
+        return lambda settings: server_session(replace(settings, tube_slots=wall_slots(settings.lanes)))
+    return None
+
+
+def _walls(options: TrainingOptions, arguments: TrainArguments) -> dict[str, Any]:
+    """How the walls reach an engine that has walls."""
+    if arguments.engine != "bullet":
+        return {}
+    return {"register_walls": WallRegistry(wall_slots(options.hyperparameters.lanes))}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import tempfile
 import zipfile
 from dataclasses import replace
@@ -18,12 +19,17 @@ import torch
 from gymnasium import spaces
 from stable_baselines3 import DQN, PPO
 
+import agent_client.paper
 from agent_client.checkpoint import read_checkpoint
 from agent_client.contract import Normalisation, require_match, running_contract
-from agent_client.errors import PolicyError
+from agent_client.errors import PolicyError, TrainingError
+from agent_client.paper import CHOICES, to_markdown
 from agent_client.policy import load_policy
+from agent_client.presets import PRESETS, UNKNOWN_TUBE
 from agent_client.settings import Settings
-from agent_client.training import Hyperparameters, Progress, TrainingOptions, fitting_minibatch, train
+from agent_client.training import log_path, state_path, train
+from agent_client.training_log import Progress, read_log
+from agent_client.training_options import Hyperparameters, TrainingOptions, fitting_minibatch
 from agent_client.tubes import TubeRecipe
 from agent_client.world import WorldOptions
 
@@ -89,7 +95,7 @@ def test_a_training_writes_a_checkpoint_with_its_contract(tmp_path: Path) -> Non
     assert seen[-1].total_steps == seen[-1].steps == 192
     assert seen[-1].seconds_left == 0.0
     assert math.isfinite(seen[-1].mean_return)
-    assert [p.name for p in tmp_path.iterdir()] == ["a.zip"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv", "a.state", "a.zip"]
 
     model = PPO.load(path, device="cpu")
     x = np.random.default_rng(0).uniform(-1, 1, (64, 37)).astype(np.float32)
@@ -194,7 +200,7 @@ def test_tensorboard_logs_are_written_where_wanted(tmp_path: Path) -> None:
 
 
 def test_a_training_that_fails_leaves_the_old_checkpoint(tmp_path: Path) -> None:
-    """A run that is stopped keeps the last checkpoint whole, and leaves no half-written file beside it."""
+    """A run that is stopped in its first iteration leaves the old checkpoint whole, and no state of another."""
     path = train(options(tmp_path / "a.zip"))
     before = path.read_bytes()
 
@@ -204,7 +210,143 @@ def test_a_training_that_fails_leaves_the_old_checkpoint(tmp_path: Path) -> None
     with pytest.raises(KeyboardInterrupt):
         train(options(tmp_path / "a.zip", seed=9), stop)
     assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["a.zip"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv", "a.zip"]
+
+
+class Killed(BaseException):
+    """Raised to end a training as a kill would: nothing of ours runs after it."""
+
+
+def stopped_after(iterations: int, *arguments: object, **options: object) -> None:
+    """Train until so many iterations are done, and one more has been collected."""
+
+    def stop(progress: Progress) -> None:
+        if progress.iteration > iterations:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(*arguments, stop, **options)
+
+
+def test_a_killed_training_is_resumed_where_it_stood(tmp_path: Path) -> None:
+    """At most one iteration is lost: counters, schedule, normalisation and curriculum go on from the last one."""
+    falling = replace(SMALL, final_learning_rate=0.0)
+    asked = options(tmp_path / "a.zip", steps=320, hyperparameters=falling)
+    stopped_after(2, asked)
+    assert load_policy(asked.out).contract.training["steps"] == 128
+    before = torch.load(state_path(asked.out), weights_only=True)
+    assert (before["iteration"], before["steps"]) == (2, 128)
+    assert [row.iteration for row in read_log(log_path(asked.out))] == [1, 2, 3]
+
+    seen: list[Progress] = []
+    train(asked, seen.append, resume=True)
+    assert [(row.iteration, row.steps) for row in seen] == [(3, 192), (4, 256), (5, 320)]
+    assert [row.iteration for row in read_log(log_path(asked.out))] == [1, 2, 3, 4, 5]
+    after = torch.load(state_path(asked.out), weights_only=True)
+    assert (after["iteration"], after["steps"]) == (5, 320)
+    assert after["count"] > before["count"] + 3 * 64 - 1
+    # Adam counts its steps: two epochs of two minibatches in each of five iterations.
+    assert {float(moments["step"]) for moments in after["optimiser"]["state"].values()} == {20.0}
+    assert after["optimiser"]["param_groups"][0]["lr"] == 0.0
+    policy = load_policy(asked.out)
+    assert policy.contract.training["steps"] == 320
+    assert np.isfinite(policy.logits(np.zeros((1, 37), np.float32))).all()
+
+
+def test_a_resumed_training_repeats_itself(tmp_path: Path) -> None:
+    """Resumed twice from the same state, a training ends in the same weights bit for bit."""
+    stopped_after(1, options(tmp_path / "a.zip"))
+    for suffix in (".zip", ".csv", ".state"):
+        shutil.copy(tmp_path / f"a{suffix}", tmp_path / f"b{suffix}")
+    one, same = (train(options(tmp_path / name), resume=True) for name in ("a.zip", "b.zip"))
+    assert [layer.weight.tobytes() for layer in read_checkpoint(one).layers or ()] == [
+        layer.weight.tobytes() for layer in read_checkpoint(same).layers or ()
+    ]
+
+
+def test_a_training_without_a_state_cannot_be_resumed(tmp_path: Path) -> None:
+    """The message says that no iteration was completed, or that the file is damaged."""
+    with pytest.raises(
+        TrainingError, match=r"a\.state: expected .* found none: no iteration of it was completed"
+    ):
+        train(options(tmp_path / "a.zip"), resume=True)
+    (tmp_path / "a.state").write_bytes(b"half a fi")
+    with pytest.raises(TrainingError, match=r"a\.state: expected .* found a damaged file"):
+        train(options(tmp_path / "a.zip"), resume=True)
+
+
+def test_a_training_is_not_resumed_with_other_options(tmp_path: Path) -> None:
+    """Whatever changes the learning is refused by its name; more steps are not."""
+    train(options(tmp_path / "a.zip"))
+    with pytest.raises(
+        TrainingError, match=r"other options: hyperparameters\.gamma: expected 0\.99, found 0\.5;"
+    ):
+        train(options(tmp_path / "a.zip", hyperparameters=replace(SMALL, gamma=0.5)), resume=True)
+    with pytest.raises(TrainingError, match="found 192 of 180 steps done; ask for more steps"):
+        train(options(tmp_path / "a.zip"), resume=True)
+    train(options(tmp_path / "a.zip", steps=256), resume=True)
+    assert load_policy(tmp_path / "a.zip").contract.training["steps"] == 256
+
+
+def test_a_critic_that_sees_more_is_resumed_whole(tmp_path: Path) -> None:
+    """The statistics of what the value network alone sees are kept too, though the contract leaves them out."""
+    world = WorldOptions(privileged=True, lags=(0, 2))
+    asked = options(tmp_path / "a.zip", world=world)
+    stopped_after(1, asked)
+    before = torch.load(state_path(asked.out), weights_only=True)
+    train(asked, resume=True)
+    policy = load_policy(asked.out)
+    assert len(policy.contract.normalisation.mean) == 2 * 37
+    assert len(before["mean"]) > 2 * 37
+
+
+def test_a_log_is_read_while_it_is_written(tmp_path: Path) -> None:
+    """A last row that is half written is left out; a file that is no log is refused."""
+    train(options(tmp_path / "a.zip"))
+    path = log_path(tmp_path / "a.zip")
+    rows = read_log(path)
+    assert [row.steps for row in rows] == [64, 128, 192]
+    assert sum(row.batch_episodes for row in rows) > 0
+    path.write_text(path.read_text()[:-3])
+    assert read_log(path) == rows[:2]
+    path.write_text("a,b\n1,2\n")
+    with pytest.raises(TrainingError, match="expected the columns iteration, steps"):
+        read_log(path)
+
+
+def test_the_presets_are_what_they_are_called() -> None:
+    """`paper` is literal and unmasked with the paper's batch; `robust` hides what no drone in a tube can know."""
+    paper = PRESETS["paper"].options
+    assert not paper.world.settings.reward.per_metre
+    assert paper.world.settings.reward.centring == 0.0
+    assert paper.world.settings.masked_features == ()
+    assert paper.world.lags == (0,)
+    assert not paper.world.privileged
+    assert paper.replay == 0.0
+    hyper = paper.hyperparameters
+    assert (hyper.batch, hyper.minibatch, hyper.gamma, hyper.entropy, hyper.clip) == (
+        13_000,
+        1300,
+        0.99,
+        0.003,
+        0.3,
+    )
+    assert hyper.learning_rate == hyper.final_learning_rate == 3e-4
+    assert (hyper.hidden, hyper.activation) == ((256, 128), "tanh")
+    robust = PRESETS["robust"]
+    assert set(robust.options.world.settings.masked_features) == set(UNKNOWN_TUBE)
+    assert robust.dynamics == "rigid-body"
+    assert all(preset.options.preset == name for name, preset in PRESETS.items())
+
+
+def test_the_papers_open_values_are_in_the_document() -> None:
+    """PAPER.md is the table of `agent_client.paper`, which has no empty cell and nothing that breaks a table."""
+    document = Path(agent_client.paper.__file__).with_name("PAPER.md")
+    assert document.read_text() == to_markdown(), "write PAPER.md anew from agent_client.paper.to_markdown()"
+    for choice in CHOICES:
+        cells = (choice.section, choice.name, choice.paper, choice.taken, choice.why)
+        assert all(cells)
+        assert not any("|" in cell or "\n" in cell for cell in cells)
 
 
 def test_a_plain_model_without_torch_says_what_to_install(

@@ -1,0 +1,94 @@
+"""The recipes of `cosim train`: `paper`, `quick` and `robust`, all of their values in one place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final, Literal, TypeAlias
+
+from agent_client.conditions import Conditions
+from agent_client.settings import RewardSettings, Settings
+from agent_client.training_options import Hyperparameters, TrainingOptions
+from agent_client.tubes import HARD_TUBES, PAPER_TUBES, VARIED_TUBES
+from agent_client.world import WorldOptions
+
+Dynamics: TypeAlias = Literal["kinematic", "rigid-body"]
+
+UNKNOWN_TUBE: Final = ("progress", "position_f", "position_u", "position_r")
+"""What a drone in an unknown tube cannot know: its progress along the tube, and its offset from the axis."""
+
+_OUT: Final = Path("policy.zip")
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A recipe: what is trained, and under which dynamics unless told otherwise."""
+
+    summary: str
+    dynamics: Dynamics
+    options: TrainingOptions
+
+
+PAPER: Final = TrainingOptions(
+    _OUT,
+    preset="paper",
+    steps=2_600_000,
+    world=WorldOptions(Settings(reward=RewardSettings(per_metre=False))),
+    hyperparameters=Hyperparameters(),
+    tubes=(PAPER_TUBES,),
+)
+"""The paper's tubes, all of its 37 features, its literal reward, its curriculum and its hyperparameters; what it
+leaves open stands in `agent_client.paper`."""
+
+QUICK: Final = TrainingOptions(
+    _OUT,
+    preset="quick",
+    steps=208_000,
+    world=WorldOptions(Settings(reward=RewardSettings(per_metre=True))),
+    hyperparameters=Hyperparameters(learning_rate=5e-4, final_learning_rate=1e-4, epochs=5),
+    tubes=(PAPER_TUBES,),
+)
+"""Past the paper's table in the least time: the paper's task, with its reward paid per metre of progress, and half
+the passes over each batch at a higher learning rate."""
+
+ROBUST: Final = TrainingOptions(
+    _OUT,
+    preset="robust",
+    steps=3_000_000,
+    seed=1,
+    world=WorldOptions(
+        Settings(masked_features=UNKNOWN_TUBE, reward=RewardSettings(per_metre=True, centring=3.0)),
+        Conditions(
+            body_radius=(0.15, 0.25),
+            field_of_view=(0.6, 1.0),
+            lidar_noise=(0.0, 0.03),
+            lidar_dropout=(0.0, 0.03),
+            camera_dropout=(0.0, 0.2),
+            gain=(1.3, 8.0),
+            compensation=(0.78, 1.07),
+        ),
+        lags=(0,),
+        privileged=True,
+    ),
+    hyperparameters=Hyperparameters(final_learning_rate=3e-5),
+    tubes=(VARIED_TUBES, HARD_TUBES),
+    replay=0.3,
+)
+"""The shipped policy's: inertia with randomised dynamics, noise, narrow view, tight bends and varied tubes; the
+policy sees neither its place in the tube nor its progress, the value network sees what was drawn."""
+
+PRESETS: Final[Mapping[str, Preset]] = MappingProxyType(
+    {
+        "paper": Preset("the paper's task, reward and hyperparameters", "kinematic", PAPER),
+        "quick": Preset("above the paper's success rates in the least time", "kinematic", QUICK),
+        "robust": Preset("the shipped policy: inertia, noise, hard tubes", "rigid-body", ROBUST),
+    }
+)
+
+
+def preset_options(name: str, out: Path, *, seed: int | None = None) -> TrainingOptions:
+    """The options of a preset, with a checkpoint to write and, unless None, a seed."""
+    options = replace(PRESETS[name].options, out=out)
+    return options if seed is None else replace(options, seed=seed)
