@@ -74,10 +74,9 @@ def _fly(run: RunJobs, options: EvaluateOptions, plan: Plan) -> Iterator[Entry]:
     flown = iter(_do(run, [job for part in jobs for job in part], "flying"))
     for (variant, level), own in zip(parts, jobs, strict=True):
         results = [next(flown) for _ in own]
-        episodes = tuple(episode for job in own for episode in job.episodes)
         for at, pilot in enumerate(plan.pilots.values()):
             ended = tuple(result for chunk in results for result in chunk[at])
-            yield Entry(variant, own[0].pilots[at], pilot, level, episodes, ended)
+            yield Entry(variant, own[0].pilots[at], pilot, level, ended)
 
 
 def _do(run: RunJobs, jobs: Sequence[Job], what: str) -> list[Any]:

@@ -33,9 +33,6 @@ from cosim.workers import Engine
 POLICIES: Final = (PURE_PURSUIT, TUNED_PURSUIT, LIDAR_RULE, SHIPPED_POLICY)
 """Who flies when nobody is named."""
 
-MAP_TUNING_EPISODES: Final = 40
-"""Tubes that tune Pure Pursuit for one cell of a map: there are many cells."""
-
 INERTIA_ALONE: Final = tuple(row.name for row in CONDITIONS if row.needs_inertia)
 """Conditions without a meaning in the kinematic world."""
 
@@ -76,14 +73,25 @@ def read_options(arguments: dict[str, Any]) -> EvaluateOptions:
     settings = take_settings(arguments)
     wants_map = arguments.pop("draw_map")
     grid = MapGrid(arguments.pop("map_gains"), arguments.pop("map_compensations"))
-    if not wants_map:
-        usual = {"dynamics": "kinematic", "engine": None, "tuning_episodes": TUNING_EPISODES}
-    elif arguments["dynamics"] == "kinematic":
-        raise CosimError("--map: gain and compensation need inertia; drop --dynamics kinematic")
-    elif arguments["out"] is None:
-        raise CosimError("--map: expected --out DIR for the picture, found none")
-    else:
-        usual = {"dynamics": "rigid-body", "engine": "reference", "tuning_episodes": MAP_TUNING_EPISODES}
+    usual: dict[str, Any] = {
+        "levels": (0, 1, 2),
+        "episodes": 100,
+        "dynamics": "kinematic",
+        "tuning_episodes": TUNING_EPISODES,
+    }
+    if wants_map:
+        if arguments["dynamics"] == "kinematic":
+            raise CosimError("--map: gain and compensation need inertia; drop --dynamics kinematic")
+        if arguments["out"] is None:
+            raise CosimError("--map: expected --out DIR for the picture, found none")
+        # There are many cells, and what is impossible is seen at the hardest level.
+        usual = {
+            "levels": (2,),
+            "episodes": 40,
+            "dynamics": "rigid-body",
+            "engine": "reference",
+            "tuning_episodes": 40,
+        }
     usual["workers"] = len(os.sched_getaffinity(0))
     given: dict[str, Any] = {
         name: usual.get(name) if value is None else value for name, value in arguments.items()

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from agent_client.conditions import NAMES, draw_conditions
-from agent_client.evaluation import Episode, EpisodeResult, summarise, wilson
+from agent_client.evaluation import EpisodeResult, summarise, wilson
 from cosim.evaluation_plan import INERTIA_ALONE, EvaluateOptions, Plan, Variant
 from cosim.named_settings import arguments_of, write_value
 from cosim.pilots import PURE_PURSUIT, TUNED_PURSUIT, Pilot, PilotChoice
@@ -33,7 +32,6 @@ class Entry:
     choice: PilotChoice
     pilot: Pilot
     level: int
-    episodes: tuple[Episode, ...]
     results: tuple[EpisodeResult, ...]
 
 
@@ -117,19 +115,22 @@ def _paper_rows(levels: Sequence[int]) -> list[dict[str, Any]]:
 
 def episodes_of(plan: Plan, entries: Sequence[Entry]) -> list[dict[str, Any]]:
     """Every episode with what it drew, and the command that flies it again under PyBullet."""
-    names = [name for name in NAMES if plan.engine != "kinematic" or name not in INERTIA_ALONE]
     rows = []
     for entry in entries:
-        drawn = draw_conditions(entry.variant.conditions, [(episode.seed,) for episode in entry.episodes])
-        settings = arguments_of(entry.variant.conditions, entry.variant.recipe)
-        for result, draw in zip(entry.results, drawn, strict=True):
-            row = asdict(result) | {"outcome": result.outcome.name.lower()}
-            row["min_clearance_m"] = row.pop("min_clearance") - float(draw["body_radius"])
+        variant = entry.variant
+        settings = arguments_of(variant.conditions, variant.recipe)
+        ranges = variant.conditions.ranges()
+        if plan.engine == "kinematic":
+            ranges = {name: span for name, span in ranges.items() if name not in INERTIA_ALONE}
+        for result in entry.results:
+            drawn = {name: float(result.conditions.get(name, low)) for name, (low, _) in ranges.items()}
+            row = asdict(result) | {"outcome": result.outcome.name.lower(), "conditions": drawn}
+            row["min_clearance_m"] = row.pop("min_clearance") - drawn["body_radius"]
             rows.append(
-                {"policy": entry.choice.name, **{n: _plain(v) for n, v in entry.variant.values.items()}}
-                | row
-                | {
-                    "conditions": {name: float(draw[name]) for name in names},
+                {
+                    "policy": entry.choice.name,
+                    **{name: _plain(value) for name, value in variant.values.items()},
+                    **row,
                     "launch": _launch(entry.choice, result, settings),
                 }
             )

@@ -169,8 +169,10 @@ def _numbers(ctx: click.Context, param: click.Parameter, value: str | None) -> t
     return tuple(sorted(numbers))
 
 
-def _levels(ctx: click.Context, param: click.Parameter, value: str) -> tuple[int, ...]:
+def _levels(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, ...] | None:
     """Read levels of the curriculum."""
+    if value is None:
+        return None
     levels = sorted(set(value.split(",")))
     if not set(levels) <= {"0", "1", "2"}:
         raise click.BadParameter(f"expected levels out of 0,1,2, found {value!r}", ctx, param)
@@ -181,17 +183,17 @@ _EVALUATE: Final = (
     click.option("--policy", "policies", multiple=True, metavar="P",
                  help="Checkpoint, pure-pursuit, pure-pursuit-tuned or lidar-rule; repeatable "
                       "[default: all three and tube_ppo]."),
-    click.option("--levels", default="0,1,2", show_default=True, callback=_levels, metavar="L,L,...",
-                 help="Levels of the curriculum."),
-    click.option("--episodes", type=click.IntRange(1, 1_000_000), default=100, show_default=True,
-                 help="Tubes a level."),
+    click.option("--levels", callback=_levels, metavar="L,L,...",
+                 help="Levels of the curriculum [default: 0,1,2; 2 for a map]."),
+    click.option("--episodes", type=click.IntRange(1, 1_000_000), metavar="N",
+                 help="Tubes a level [default: 100; 40 a cell of a map]."),
     click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True,
                  help="Of tubes, starts and conditions; training sees none of them."),
-    click.option("--dynamics", type=click.Choice(["kinematic", "rigid-body"]), default=None,
+    click.option("--dynamics", type=click.Choice(["kinematic", "rigid-body"]),
                  help="World [default: kinematic]."),
-    click.option("--engine", type=click.Choice(["bullet", "reference"]), default=None,
+    click.option("--engine", type=click.Choice(["bullet", "reference"]),
                  help="Of rigid bodies: a PyBullet server, or in process [default: bullet]."),
-    click.option("--tuning-episodes", type=click.IntRange(5, 100_000), default=None, metavar="N",
+    click.option("--tuning-episodes", type=click.IntRange(5, 100_000), metavar="N",
                  help="Tubes that tune Pure Pursuit [default: 100; 40 a cell of a map]."),
     click.option("--sweep", metavar="NAME=V1,V2,...", help="Evaluate for each value of one named setting."),
     click.option("--map", "draw_map", is_flag=True,
@@ -201,7 +203,7 @@ _EVALUATE: Final = (
                  show_default=True, help="Columns of the map (1/s)."),
     click.option("--map-compensations", callback=_numbers, metavar="C,C,...", default="0.7,0.8,0.9,1,1.1",
                  show_default=True, help="Rows of the map (weight)."),
-    click.option("--workers", type=click.IntRange(1, 512), default=None, metavar="N",
+    click.option("--workers", type=click.IntRange(1, 512), metavar="N",
                  help="Processes that fly; results do not depend on it [default: the cores]."),
     click.option("--out", type=click.Path(path_type=Path), metavar="DIR",
                  help="Write results.json with every episode, and the map."),

@@ -52,7 +52,8 @@ def draw_map(path: Path, report: dict[str, Any]) -> None:
     figure.colorbar(image, ax=panels, label="success (%)", shrink=0.9)
     hard = ", hard conditions otherwise" if report["hard"] else ""
     figure.suptitle(
-        f"Success of {report['episodes']} flights a cell, engine {report['engine']}, seed {report['seed']}{hard}",
+        f"Success of {report['episodes']} flights a cell, engine {report['engine']}, seed {report['seed']}{hard}; "
+        "Pure Pursuit tuned anew for every cell",
         fontsize=10,
     )
     try:

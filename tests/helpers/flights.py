@@ -10,6 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from click.testing import CliRunner
+
+from cosim.cli import cosim
+from cosim.errors import exit_status
+
 ROOT = Path(__file__).resolve().parents[2]
 DEADLINE = 240.0
 """Seconds after which a subprocess of a test is given up: compiling may be part of it."""
@@ -51,6 +56,18 @@ def run_cosim(*arguments: str, cwd: Path) -> Done:
         timeout=DEADLINE,
     )
     return Done(done.returncode, done.stdout, done.stderr)
+
+
+def run_here(*arguments: str) -> Done:
+    """Run `cosim` in this process, for what starts no other: its status and all that it says."""
+    result = CliRunner().invoke(cosim, arguments)
+    error = result.exception
+    if error is None or isinstance(error, SystemExit):
+        return Done(result.exit_code, result.stdout, result.stderr)
+    status = exit_status(error)
+    if status is None:
+        raise error
+    return Done(status, result.stdout, f"{result.stderr}cosim: {error}\n")
 
 
 def leftovers(session: str) -> list[str]:
