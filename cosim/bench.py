@@ -1,4 +1,4 @@
-"""`cosim bench`: round trip, whole control loop and start-up on this machine, side by side in one run."""
+"""`cosim bench`: round trip, whole control loop and start-up on this machine, or the speed of training."""
 
 from __future__ import annotations
 
@@ -18,19 +18,24 @@ from agent_client.settings import Settings
 from cosim.loop_limit import network_microseconds, physics_microseconds, rays_microseconds
 from cosim.round_trip import Quantiles, measure
 from cosim.runs import read_run
+from cosim.train import load_training
 from meshes.tube import INDUSTRIAL, read_tube
 
 LAYERS: Final = (37, 256, 128, 36)
 """The paper's network."""
 
 
-def bench(*, as_json: bool, quick: bool) -> None:
+def bench(*, as_json: bool, quick: bool, training: bool = False) -> None:
     """Measure and print: a table for people, or one JSON object.
 
     Args:
         as_json: one JSON object on stdout and nothing else.
         quick: fewer samples and repeats.
+        training: the speed of training instead of the loop's.
     """
+    if training:
+        bench_training(as_json=as_json, quick=quick)
+        return
     samples, repeats = (2_000, 1) if quick else (20_000, 5)
 
     def say(text: str) -> None:
@@ -46,6 +51,15 @@ def bench(*, as_json: bool, quick: bool) -> None:
         click.echo(json.dumps(figures))
     else:
         click.echo(table(figures))
+
+
+def bench_training(*, as_json: bool, quick: bool) -> None:
+    """Measure training and print, as `bench` does."""
+    load_training()  # says what to install before anything is measured
+    from cosim.bench_training import LOOK, MEASUREMENT, measure_training, training_table
+
+    figures = measure_training(LOOK if quick else MEASUREMENT, lambda text: click.echo(text, err=True))
+    click.echo(json.dumps({"training": figures}) if as_json else training_table(figures))
 
 
 def measure_loop(repeats: int) -> dict[str, Any]:

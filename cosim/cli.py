@@ -129,7 +129,9 @@ def figures(folder: Path) -> None:
         click.echo(path)
 
 
-@cosim.command(cls=SettingsCommand, short_help="Fly pilots through many unseen tubes, beside the paper's figures.")
+@cosim.command(
+    cls=SettingsCommand, short_help="Fly pilots through many unseen tubes, beside the paper's figures."
+)
 @evaluate_options
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, nothing else.")
 def evaluate(as_json: bool, **options: Any) -> None:
@@ -145,14 +147,17 @@ def evaluate(as_json: bool, **options: Any) -> None:
     run(read_options(options), as_json=as_json)
 
 
-@cosim.command(short_help="Measure round trip, control loop and start-up on this machine.")
+@cosim.command(short_help="Measure round trip, control loop and start-up, or training, on this machine.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, nothing else.")
 @click.option("--quick", is_flag=True, help="Fewer samples: a look, not a measurement.")
-def bench(as_json: bool, quick: bool) -> None:
+@click.option(
+    "--training", is_flag=True, help="The speed of training instead: environment, PPO, past the paper."
+)
+def bench(as_json: bool, quick: bool, training: bool) -> None:
     """Measure the protocol's round trip, the whole control loop and the start-up, side by side in one run."""
     from cosim.bench import bench as run
 
-    run(as_json=as_json, quick=quick)
+    run(as_json=as_json, quick=quick, training=training)
 
 
 def _interrupted(number: int, _frame: FrameType | None) -> None:

@@ -65,7 +65,7 @@ def train(arguments: TrainArguments, out: Path | None, resume: Path | None) -> N
         folder = out or Path("runs/training")
         _refuse_training(folder)
         arguments = _completed(arguments)
-    run = _training()
+    run = load_training()
     if resume is None:
         _begin_folder(folder, arguments)
     options = _options(folder, arguments)
@@ -113,7 +113,12 @@ def print_choices(preset: str | None) -> None:
     click.echo(to_markdown())
 
 
-def _training() -> Callable[..., Path]:
+def load_training() -> Callable[..., Path]:
+    """`agent_client.training.train`, loaded with torch when it is first needed.
+
+    Raises:
+        CosimError: the extra `train` is not installed.
+    """
     limit_spinning()
     try:
         from agent_client.training import train as run
