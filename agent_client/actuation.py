@@ -36,6 +36,8 @@ class CommandPath:
         self._lanes = np.arange(lanes)
         self._delay: Ints = np.zeros(lanes, dtype=np.int64)
         self._near_wall: Floats = np.zeros(lanes)
+        self._straight = True
+        """Whether all commands go through as they are."""
         self._speed_max = speed_max
         self._sent = CommandBatch.zeros(lanes)
 
@@ -49,12 +51,14 @@ class CommandPath:
             commands: (N,) whose `compensation` is written, and nothing else.
         """
         commands.compensation[lanes] = drawn["compensation"]
-        self._delay[lanes] = drawn["action_delay"].astype(np.int64)
+        self._delay[lanes] = delay = drawn["action_delay"].astype(np.int64)
         self._near_wall[lanes] = drawn["near_wall"]
-        waiting = commands.raw[lanes]
-        waiting[:, :3] = step.frame[lanes, 0]
-        waiting[:, 3] = 0.0
-        self._ring[:, lanes] = waiting
+        self._straight = not (self._delay.any() or self._near_wall.any())
+        if delay.any():
+            waiting = commands.raw[lanes]
+            waiting[:, :3] = step.frame[lanes, 0]
+            waiting[:, 3] = 0.0
+            self._ring[:, lanes] = waiting
 
     def send(self, commands: CommandBatch, step: TaskStep) -> CommandBatch:
         """What the plant gets in place of these commands; the same object without delay and disturbance.
@@ -63,7 +67,7 @@ class CommandPath:
             commands: (N,) decided now.
             step: what they were decided on.
         """
-        if not (self._delay.any() or self._near_wall.any()):
+        if self._straight:
             return commands
         self._head = (self._head + 1) % len(self._ring)
         self._ring[self._head] = commands.raw

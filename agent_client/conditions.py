@@ -7,12 +7,14 @@ hard evaluation uses. None of this is the paper's: it flies one drone under one 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from agent_client.errors import SettingsError
@@ -21,6 +23,7 @@ from protocol.plant import PARAMETER_INDEX, ResetBatch
 
 Range = tuple[float, float]
 Records = NDArray[Any]
+Floats = NDArray[np.float64]
 
 DELAY_MAX: Final = 10
 """Longest delay (control steps)."""
@@ -95,8 +98,8 @@ PARAMETERS_OF: Final = {
 }
 """Conditions that are plant parameters (`protocol.plant.PARAMETERS`), and their names there."""
 
-_COLUMNS: Final = [NAMES.index(name) for name in PARAMETERS_OF]
-_SLOTS: Final = [PARAMETER_INDEX[name] for name in PARAMETERS_OF.values()]
+_COLUMNS: Final = np.array([NAMES.index(name) for name in PARAMETERS_OF])
+_SLOTS: Final = np.array([PARAMETER_INDEX[name] for name in PARAMETERS_OF.values()])
 
 
 @dataclass(frozen=True)
@@ -131,9 +134,9 @@ class Conditions:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
-    def bounds(self) -> NDArray[np.float64]:
+    def bounds(self) -> Floats:
         """The lower and the upper ends of the ranges, (2, C), in the order of the table."""
-        return np.array(list(self.ranges().values()), dtype=np.float64).T
+        return np.array(list(self.ranges().values()), dtype=np.float64).T.copy()
 
     def changed(self) -> dict[str, Range]:
         """The ranges that differ from the defaults, by name."""
@@ -178,17 +181,26 @@ def draw_conditions(conditions: Conditions, seeds: ArrayLike) -> Records:
     """
     words = np.asarray(seeds, dtype=np.uint64)
     drawn = np.zeros(len(words), DRAWN)
-    # One draw for each condition, in the order of the table: narrowing one range moves no other's draw.
-    shares = np.empty((len(words), len(NAMES)))
-    spread_seeds(words, _TAG, shares, drawn["seed"])
-    low, high = conditions.bounds
     values = _values(drawn)
-    values[:] = low + shares * (high - low + _WHOLE)
-    values[:, _WHOLE] = np.minimum(np.floor(values[:, _WHOLE]), high[_WHOLE])
+    # One draw for each condition, in the order of the table: narrowing one range moves no other's draw.
+    spread_seeds(words, _TAG, values, drawn["seed"])
+    _place(values, conditions.bounds, _WHOLE)
     return drawn
 
 
-def _values(drawn: Records) -> NDArray[np.float64]:
+@njit(cache=True)
+def _place(values: Floats, bounds: Floats, whole: NDArray[np.bool_]) -> None:
+    """Turn numbers in (0, 1), (K, C), into numbers within the bounds (2, C), whole ones where asked for."""
+    for k in range(values.shape[0]):
+        for c in range(values.shape[1]):
+            low, high = bounds[0, c], bounds[1, c]
+            if whole[c]:
+                values[k, c] = min(math.floor(low + values[k, c] * (high - low + 1.0)), high)
+            else:
+                values[k, c] = low + values[k, c] * (high - low)
+
+
+def _values(drawn: Records) -> Floats:
     """The conditions in records of DRAWN as a view (K, C), in the order of the table."""
     return drawn.view(np.float64).reshape(len(drawn), -1)[:, : len(NAMES)]
 

@@ -190,18 +190,19 @@ class TubeTask:
         lanes = np.ascontiguousarray(lanes, dtype=np.int64)
         episodes, length = self._episodes, self.geometry.length[lanes]
         limits = [self._step_limit or max_steps(self.settings, float(metres), self.dt) for metres in length]
-        episodes[lanes] = np.zeros((), dtype=episodes.dtype)
-        episodes["length"][lanes] = length
-        episodes["max_steps"][lanes] = limits
-        episodes["memory_age"][lanes] = self.settings.memory.steps + 1
-        episodes["min_clearance"][lanes] = np.inf
+        fresh = np.zeros(len(lanes), dtype=episodes.dtype)
+        fresh["length"] = length
+        fresh["max_steps"] = limits
+        fresh["memory_age"] = self.settings.memory.steps + 1
+        fresh["min_clearance"] = np.inf
         if drawn is None:
-            episodes["body_radius"][lanes] = self.settings.drone.body_radius
-            episodes["field_of_view"][lanes] = 1.0
+            fresh["body_radius"] = self.settings.drone.body_radius
+            fresh["field_of_view"] = 1.0
         else:
             for name in (*SENSED, "observation_delay"):
-                episodes[name][lanes] = drawn[name]
-            episodes["noise_seed"][lanes] = drawn["seed"]
+                fresh[name] = drawn[name]
+            fresh["noise_seed"] = drawn["seed"]
+        episodes[lanes] = fresh
         self._near[lanes] = np.nan
         active = None
         if len(lanes) < self.lanes:
