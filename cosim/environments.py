@@ -8,17 +8,13 @@ The makers take the fields of `agent_client.gym_env.TubeEnvOptions` by their nam
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
-from dataclasses import replace
 from typing import Any
 
 from agent_client.gym_env import TubeEnv, TubeEnvOptions, TubeVectorEnv
 from agent_client.kinematic import KinematicPlant
 from agent_client.world import OpenSession
 from cosim.options import DEFAULT_PHYSICS_DT
-from cosim.sessions import server_session
-from cosim.walls import WallRegistry, wall_slots
-from protocol.agent import AgentSession, SessionSettings
+from cosim.walls import WallRegistry, wall_slots, walled_session
 from protocol.twin import open_twin
 
 
@@ -36,17 +32,12 @@ def make_kinematic_vector(num_envs: int = 1, **options: Any) -> TubeVectorEnv:
 
 def make_cosim(**options: Any) -> TubeEnv:
     """One drone in a physics process of its own, with walls (`cosim/TubeCosim-v0`)."""
-    return TubeEnv(open_walled, _rigid(options), WallRegistry(wall_slots(1)))
+    return TubeEnv(walled_session, _rigid(options), WallRegistry(wall_slots(1)))
 
 
 def make_cosim_vector(num_envs: int = 1, **options: Any) -> TubeVectorEnv:
     """N drones in one physics process with walls (`cosim/TubeCosim-v0` by `gymnasium.make_vec`)."""
-    return TubeVectorEnv(open_walled, num_envs, _rigid(options), WallRegistry(wall_slots(num_envs)))
-
-
-def open_walled(settings: SessionSettings) -> AbstractContextManager[AgentSession]:
-    """A session with a Bullet server of its own, with slots for the walls of a `WallRegistry`."""
-    return server_session(replace(settings, tube_slots=wall_slots(settings.lanes)))
+    return TubeVectorEnv(walled_session, num_envs, _rigid(options), WallRegistry(wall_slots(num_envs)))
 
 
 def _kinematic(options: TubeEnvOptions) -> OpenSession:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import hashlib
 import tempfile
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from cosim.errors import CosimError
+from cosim.sessions import server_session
 from meshes.sweep import sweep_wall, write_obj
 from meshes.swept import SweptTube
-from protocol.agent import AgentSession
+from protocol.agent import AgentSession, SessionSettings
 from protocol.plant import TubeReference
 
 KEPT: Final = 256
@@ -24,6 +27,11 @@ SIDES_PER_LOBE: Final = 16
 def wall_slots(lanes: int) -> int:
     """How many walls to keep for so many lanes: what to open a session with, as its `tube_slots`."""
     return max(KEPT, 2 * lanes)
+
+
+def walled_session(settings: SessionSettings) -> AbstractContextManager[AgentSession]:
+    """A session with a Bullet server of its own that has slots for the walls of `WallRegistry(wall_slots(lanes))`."""
+    return server_session(replace(settings, tube_slots=wall_slots(settings.lanes)), "bullet")
 
 
 class WallRegistry:

@@ -186,8 +186,14 @@ print(env.unwrapped.session.peer_pid, flush=True)
 """
 
 
-@pytest.mark.parametrize("make", [f"make({COSIM!r})", f"make_vec({COSIM!r}, num_envs=2, pool=2)"])
-@pytest.mark.parametrize(("end", "status"), [("raise RuntimeError('a bug')", 1), ("sys.exit(5)", 5), ("", 0)])
+@pytest.mark.parametrize(
+    ("make", "end", "status"),
+    [
+        (f"make({COSIM!r})", "raise RuntimeError('a bug')", 1),
+        (f"make_vec({COSIM!r}, num_envs=2, pool=2)", "sys.exit(5)", 5),
+        (f"make({COSIM!r})", "", 0),
+    ],
+)
 def test_a_program_that_ends_takes_its_physics_process_along(make: str, end: str, status: int) -> None:
     """By an exception, by sys.exit, or at its last line, without ever closing the environment."""
     done = Program(PROGRAM.format(make=make, end=end))
