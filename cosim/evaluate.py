@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,8 +16,10 @@ from cosim.errors import OutputError
 from cosim.evaluation_plan import EvaluateOptions, Plan, make_plan
 from cosim.evaluation_report import Entry, episodes_of, report_of
 from cosim.evaluation_table import map_lines, table_lines
+from cosim.folders import make_folder, remove_empty
 from cosim.live import counting
 from cosim.pilots import TUNED_PURSUIT, PilotChoice
+from cosim.success_map import draw_map, require_matplotlib
 from cosim.workers import BULLET_EPISODES, LANES, FlyJob, Job, RunJobs, TuneJob, crew
 
 RESULTS: Final = "results.json"
@@ -30,27 +34,25 @@ def evaluate(options: EvaluateOptions, *, as_json: bool) -> None:
         ProtocolError: a physics server failed.
     """
     plan = make_plan(options)
-    if options.out is not None:
-        _make_folder(options.out)
+    if options.grid is not None:
+        require_matplotlib()
     for pilot in plan.pilots.values():
         for note in pilot.notes:
             click.echo(note, err=True)
-    with crew(options.workers) as run:
+    with _results_folder(options.out), crew(options.workers) as run:
         entries = list(_fly(run, options, plan))
     report = report_of(options, plan, entries)
     if options.out is not None:
         _write(options.out / RESULTS, report | {"flown": episodes_of(plan, entries)})
-    if options.out is not None and options.grid is not None:
-        from cosim.success_map import draw_map
-
-        draw_map(options.out / MAP, report)
+        if options.grid is not None:
+            draw_map(options.out / MAP, report)
     if as_json:
         click.echo(json.dumps(report, allow_nan=False))
     else:
         for line in table_lines(report) if options.grid is None else map_lines(report):
             click.echo(line)
     if options.out is not None:
-        click.echo(f"every episode, and how to fly it again: {options.out / RESULTS}", err=True)
+        click.echo(f"every episode, and how to fly it in PyBullet: {options.out / RESULTS}", err=True)
 
 
 def _fly(run: RunJobs, options: EvaluateOptions, plan: Plan) -> Iterator[Entry]:
@@ -89,22 +91,28 @@ def _do(run: RunJobs, jobs: Sequence[Job], what: str) -> list[Any]:
     return results
 
 
-def _make_folder(folder: Path) -> None:
-    """Create the folder of the results.
+@contextmanager
+def _results_folder(folder: Path | None) -> Iterator[None]:
+    """Create the folder of the results before all the flying; what was made goes again where that fails.
 
     Raises:
         OutputError: it holds results already, or cannot be written.
     """
+    if folder is None:
+        yield
+        return
     if (folder / RESULTS).exists():
         raise OutputError(
             f"--out {folder}: expected a folder without {RESULTS}, found one; name another folder"
         )
+    _, made = make_folder(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / RESULTS).touch()  # now rather than after all the flying
-        (folder / RESULTS).unlink()
-    except OSError as error:
-        raise OutputError(f"--out {folder}: cannot be written: {error.strerror}") from error
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise OutputError(f"--out {folder}: expected a folder that can be written, found one that cannot")
+        yield
+    except BaseException:
+        remove_empty(made)
+        raise
 
 
 def _write(path: Path, report: dict[str, Any]) -> None:

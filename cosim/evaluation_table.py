@@ -100,7 +100,7 @@ def _legend(report: Row) -> Iterator[str]:
     """What was flown, and what each pilot knew."""
     yield (
         "success, exit, collision, time-out in %; 95 %: Wilson's interval of the success; Q: centring and alignment; "
-        "length: steps over the fewest possible, of the successes; the paper tells exits and collisions not apart"
+        "length: steps over the fewest possible, of the successes; the paper counts every failure as an exit"
     )
     rows = report["rows"]
     for name in dict.fromkeys(row["policy"] for row in rows):

@@ -48,21 +48,31 @@ def new_folder(out: Path | None, label: str) -> Iterator[Path]:
     Raises:
         OutputError: it cannot be created.
     """
-    folder, made = _make(out) if out is not None else _make_free(label)
+    folder, made = make_folder(out) if out is not None else _make_free(label)
     try:
         yield folder
     except BaseException as error:
         if exit_status(error) != PEER and not (folder / MANIFEST).exists():
             for name in LOGS:
                 (folder / name).unlink(missing_ok=True)
-            for path in made:
-                with suppress(OSError):  # not empty: something of the user's is in it
-                    path.rmdir()
+            remove_empty(made)
         raise
 
 
-def _make(folder: Path, *, new: bool = False) -> tuple[Path, list[Path]]:
-    """Create a folder; returns it, and which folders were made for it, the innermost first."""
+def remove_empty(folders: list[Path]) -> None:
+    """Remove folders, the innermost first, that nothing is in."""
+    for path in folders:
+        with suppress(OSError):  # not empty: something of the user's is in it
+            path.rmdir()
+
+
+def make_folder(folder: Path, *, new: bool = False) -> tuple[Path, list[Path]]:
+    """Create a folder; returns it, and which folders were made for it, the innermost first.
+
+    Raises:
+        OutputError: it cannot be created.
+        FileExistsError: it exists, and is to be `new`.
+    """
     made = [path for path in (folder, *folder.absolute().parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=not new)
@@ -79,7 +89,7 @@ def _make_free(label: str) -> tuple[Path, list[Path]]:
     stem = Path("runs") / f"{stamp}-{label}"
     for number in itertools.count(1):
         try:
-            return _make(stem if number == 1 else stem.with_name(f"{stem.name}-{number}"), new=True)
+            return make_folder(stem if number == 1 else stem.with_name(f"{stem.name}-{number}"), new=True)
         except FileExistsError:
             continue
     raise AssertionError

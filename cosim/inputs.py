@@ -39,7 +39,7 @@ class Conduit:
 
 
 @dataclass(frozen=True)
-class Weather:
+class FlightConditions:
     """The conditions of one flight: what they were drawn from, and what came of it."""
 
     ranges: Conditions
@@ -49,6 +49,11 @@ class Weather:
     """For `agent_client.flight.fly`."""
     parameters: Mapping[str, float]
     """Plant parameters that the user named."""
+
+    @property
+    def chosen(self) -> dict[str, tuple[float, float]]:
+        """The ranges that the user chose, by name."""
+        return {name: span for name, span in self.ranges.ranges().items() if name in self.named}
 
     @property
     def drone(self) -> dict[str, float]:
@@ -170,7 +175,9 @@ def _describe(
     }
 
 
-def draw_weather(options: FlightOptions, conditions: Conditions, parameters: Mapping[str, float]) -> Weather:
+def draw_flight_conditions(
+    options: FlightOptions, conditions: Conditions, parameters: Mapping[str, float]
+) -> FlightConditions:
     """What a flight draws from its conditions, by its seed; a plant parameter that is named stands for itself.
 
     Raises:
@@ -183,7 +190,7 @@ def draw_weather(options: FlightOptions, conditions: Conditions, parameters: Map
     for name, parameter in PARAMETERS_OF.items():
         if parameter in parameters:
             drawn[name] = parameters[parameter]
-    return Weather(
+    return FlightConditions(
         conditions, frozenset({*conditions.changed(), *options.settings.conditions}), drawn, parameters
     )
 

@@ -26,9 +26,9 @@ from cosim.folders import check_folder, new_folder
 from cosim.inputs import (
     TUBE_FILES,
     Conduit,
-    Weather,
+    FlightConditions,
     check_options,
-    draw_weather,
+    draw_flight_conditions,
     find_mesh,
     generate_conduit,
     parse_parameters,
@@ -56,7 +56,7 @@ class Flight:
     options: FlightOptions
     conduit: Conduit
     pilot: Pilot
-    weather: Weather
+    conditions: FlightConditions
     session: AgentSession
     rendezvous: str
     folder: Path
@@ -80,8 +80,8 @@ def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
     check_options(options)
     command = None if options.connect is not None else physics_command(options.server)
     rendezvous = rendezvous_of(options.connect, options.session, options.transport)
-    conditions, recipe = options.settings.resolve()
-    weather = draw_weather(options, conditions, parse_parameters(options.parameters))
+    ranges, recipe = options.settings.resolve()
+    conditions = draw_flight_conditions(options, ranges, parse_parameters(options.parameters))
     mesh, choice = find_mesh(options), choose_pilot(options.policy, options.lookahead, options.speed)
     for note in _chosen_for_the_user(mesh, choice):
         say(note)
@@ -97,8 +97,8 @@ def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
             stack.callback(_forget_unflown, folder)
         else:
             conduit = read_conduit(options, mesh)
-        pilot = read_pilot(choice, Terms(options.dt, options.allow_mismatch, weather.drone))
-        for note in (*pilot.notes, *weather.notes):
+        pilot = read_pilot(choice, Terms(options.dt, options.allow_mismatch, conditions.drone))
+        for note in (*pilot.notes, *conditions.notes):
             say(note)
         settings = SessionSettings(1, pilot.dt, options.physics_dt)
         session = stack.enter_context(
@@ -106,7 +106,7 @@ def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
         )
         plant = session.description
         say(f"physics: {plant.name} {plant.version}, engine {plant.engine}")
-        report = _fly_recorded(Flight(options, conduit, pilot, weather, session, rendezvous, folder))
+        report = _fly_recorded(Flight(options, conduit, pilot, conditions, session, rendezvous, folder))
     if as_json:
         click.echo(json.dumps(report))
     else:
@@ -141,8 +141,8 @@ def _fly_recorded(flight: Flight) -> dict[str, Any]:
     options, pilot, session, folder = flight.options, flight.pilot, flight.session, flight.folder
     names = [parameter.name for parameter in PARAMETERS]
     defaults = dict(zip(names, session.description.defaults, strict=True))
-    geometry, parameters = flight.conduit.geometry, flight.weather.parameters
-    drawn = flight.weather.over(defaults)
+    geometry, parameters = flight.conduit.geometry, flight.conditions.parameters
+    drawn = flight.conditions.over(defaults)
     # Refuses a tube without room for the drone before anything is recorded.
     resets = build_resets(
         session.description,
@@ -271,7 +271,7 @@ def _manifest(
         chosen: the parameters that are flown with.
     """
     options, pilot, session = flight.options, flight.pilot, flight.session
-    weather, length = flight.weather, flight.conduit.length
+    conditions, length = flight.conditions, flight.conduit.length
     return {
         "cosim": __version__,
         "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
@@ -281,7 +281,7 @@ def _manifest(
         "policy": pilot.description,
         "settings": asdict(pilot.settings),
         "conditions": {
-            "chosen": {name: span for name, span in weather.ranges.ranges().items() if name in weather.named},
+            "chosen": conditions.chosen,
             "drawn": {name: float(drawn[name][0]) for name in NAMES},
             "noise_seed": int(drawn["seed"][0]),
         },

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cosim.errors import CosimError, OutputError
+
+
+def require_matplotlib() -> None:
+    """Refuse before anything is flown.
+
+    Raises:
+        CosimError: matplotlib is not installed.
+    """
+    if find_spec("matplotlib") is None:
+        raise CosimError("--map needs matplotlib; install the extra with: pip install 'tube-cosim[view]'")
 
 
 def draw_map(path: Path, report: dict[str, Any]) -> None:
@@ -18,15 +29,10 @@ def draw_map(path: Path, report: dict[str, Any]) -> None:
         report: of an evaluation whose rows carry `gain` and `compensation`.
 
     Raises:
-        CosimError: matplotlib is not installed.
         OutputError: the file cannot be written.
     """
-    try:
-        from matplotlib.figure import Figure  # without pyplot: no display, and nothing global
-    except ImportError as error:
-        raise CosimError(
-            f"--map needs {error.name}; install the extra with: pip install 'tube-cosim[view]'"
-        ) from error
+    from matplotlib.figure import Figure  # without pyplot: no display, and nothing global
+
     rows = report["rows"]
     names = list(dict.fromkeys(row["policy"] for row in rows))
     levels = sorted({row["level"] for row in rows})

@@ -93,7 +93,7 @@ def test_results_do_not_depend_on_the_workers(tmp_path: Path, engine: str) -> No
         out = tmp_path / workers
         done = run_cosim(
             "evaluate", "--policy", "lidar-rule", "--policy", "tube_ppo", "--hard", "--levels", "1,2",
-            "--episodes", "4", "--dynamics", "rigid-body", "--engine", engine, "--workers", workers,
+            "--episodes", "2", "--dynamics", "rigid-body", "--engine", engine, "--workers", workers,
             "--out", str(out), cwd=tmp_path,
         )  # fmt: skip
         assert done.status == 0, done.stderr
