@@ -45,7 +45,7 @@ leaves open stands in `agent_client.paper`."""
 QUICK: Final = TrainingOptions(
     _OUT,
     preset="quick",
-    steps=208_000,
+    steps=234_000,
     world=WorldOptions(Settings(reward=RewardSettings(per_metre=True))),
     hyperparameters=Hyperparameters(learning_rate=5e-4, final_learning_rate=1e-4, epochs=5),
     tubes=(PAPER_TUBES,),

@@ -59,11 +59,12 @@ def _draw(axes: Any, rows: Sequence[Progress], kind: str) -> None:
     value = scale * np.array([getattr(row, f"batch_{kind}") for row in rows])
     axes.plot(iteration, value, color=_INK[kind], linewidth=1.6, label="episodes that ended in the iteration")
     if kind == "success":
-        axes.set(ylabel="success rate (%)", ylim=(-2.0, 105.0), title="Success rate in training")
+        axes.set(ylabel="success rate (%)", ylim=(-2.0, 120.0), title="Success rate in training")
+        axes.set_yticks(range(0, 101, 20))
         _draw_thresholds(axes, rows)
     else:
         axes.set(ylabel="mean return of an episode", title="Mean return in training")
-        axes.margins(y=0.12)
+        axes.margins(y=0.2)
     axes.set(xlabel=f"iteration ({rows[0].steps:,} control steps each)", xlim=_limits(iteration))
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.grid(alpha=0.25)
@@ -95,11 +96,10 @@ def _mark_levels(axes: Any, rows: Sequence[Progress]) -> None:
         axes.axvspan(begin, end, color="black", alpha=0.03 * level, linewidth=0.0)
         axes.annotate(
             f"level {level}",
-            (0.5 * (begin + end), 1.0),
+            (begin, 1.0),
             xycoords=axes.get_xaxis_transform(),
-            xytext=(0, -4),
+            xytext=(4, -4 - 11 * level),  # one below the other: a stay may be shorter than its name
             textcoords="offset points",
-            ha="center",
             va="top",
             fontsize=9,
         )

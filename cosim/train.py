@@ -25,6 +25,8 @@ if TYPE_CHECKING:  # torch is loaded only when training begins
     from agent_client.training_options import TrainingOptions
 
 CHECKPOINT: Final = "policy.zip"
+STATE: Final = "policy.state"
+LOG: Final = "policy.csv"
 ARGUMENTS: Final = "training.json"
 """The arguments of the command, kept for `--resume`."""
 
@@ -70,9 +72,8 @@ def train(arguments: TrainArguments, out: Path | None, resume: Path | None) -> N
         _begin_folder(folder, arguments)
     options = _options(folder, arguments)
     click.echo(_announcement(options, arguments, resumed=resume is not None), err=True)
-    checkpoint = options.out
     try:
-        with TrainingDisplay(options.preset, options.steps) as display:
+        with TrainingDisplay(options.steps) as display:
             written = run(
                 options,
                 display.update,
@@ -81,13 +82,15 @@ def train(arguments: TrainArguments, out: Path | None, resume: Path | None) -> N
                 resume=resume is not None,
             )
     except (KeyboardInterrupt, Terminated):
-        if checkpoint.with_suffix(".state").exists():
-            text = f"training stopped; {checkpoint} is its last iteration; go on with: cosim train --resume {folder}"
+        if (folder / STATE).exists():
+            text = f"training stopped; {options.out} is its last iteration; go on with: cosim train --resume {folder}"
         else:
             text = "training stopped before its first iteration was completed; nothing was kept"
         click.echo(text, err=True)
         raise
-    for figure in draw_figures(checkpoint.with_suffix(".csv"), folder):
+    except OSError as error:
+        raise OutputError(f"--out {folder}: cannot be written: {error.strerror}") from error
+    for figure in draw_figures(folder / LOG, folder):
         click.echo(figure, err=True)
     click.echo(written)
 
@@ -175,7 +178,7 @@ def _refuse_training(folder: Path) -> None:
     Raises:
         OutputError: it does.
     """
-    for name in (CHECKPOINT, ARGUMENTS):
+    for name in (CHECKPOINT, STATE):
         if (folder / name).exists():
             raise OutputError(
                 f"--out {folder}: expected a folder without a training, found {name}; name another folder, or go "

@@ -18,21 +18,19 @@ class TrainingDisplay:
     """Level, success rate over the last 300 episodes, mean return, steps per second and time left, on stderr.
 
     Args:
-        name: what is trained.
         steps: control steps in all.
     """
 
-    def __init__(self, name: str, steps: int) -> None:
+    def __init__(self, steps: int) -> None:
         self._bar = None
         if sys.stderr is not None and sys.stderr.isatty():
             # rich draws bars and degrades on dumb terminals; imported only where a line is drawn.
             from rich.console import Console
-            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+            from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
             self._bar = Progress(
-                TextColumn(name),
+                SpinnerColumn(),
                 BarColumn(24),
-                TimeElapsedColumn(),
                 TextColumn("{task.fields[text]}"),
                 console=Console(stderr=True),
                 refresh_per_second=2,
