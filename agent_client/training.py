@@ -32,11 +32,12 @@ from agent_client.curriculum import Curriculum
 from agent_client.environment import TubeVecEnv
 from agent_client.errors import TrainingError
 from agent_client.features import FEATURES
+from agent_client.imitation import Imitator
 from agent_client.kinematic import KinematicPlant
 from agent_client.sb3_policy import ACTIVATIONS, AsymmetricPolicy, actor_of
 from agent_client.start import RegisterWalls
 from agent_client.training_log import EpisodeMeans, Progress, append_log, cut_log
-from agent_client.training_options import Hyperparameters, TrainingOptions, fitting_minibatch
+from agent_client.training_options import Hyperparameters, Imitation, TrainingOptions, fitting_minibatch
 from agent_client.training_state import TrainingState, comparable, read_state, write_state
 from agent_client.tubes import LEVELS, draw_pool
 from agent_client.world import TubeWorld
@@ -92,7 +93,7 @@ def train(
     with opener(session_settings) as session:
         engine = session.description.engine
         state = read_state(state_path(options.out), options, engine) if resume else None
-        curriculum = Curriculum(replay=options.replay)
+        curriculum = Curriculum(replay=options.replay, level=options.first_level)
         world = TubeWorld(session, pools, curriculum, options.world, options.seed, register_walls)
         env = VecNormalize(
             TubeVecEnv(world),
@@ -102,15 +103,18 @@ def train(
             epsilon=hyper.epsilon,
         )
         model = _make_model(env, options, _seed_of(options.seed, state.iteration if state else 0))
-        watcher = _Watcher(options, curriculum, env, engine, on_progress)
+        watcher = _Watcher(options, model, curriculum, env, engine, on_progress)
         if state is not None:
-            watcher.restore(model, state)
+            watcher.restore(state)
         else:
             state_path(options.out).unlink(missing_ok=True)
         options.out.parent.mkdir(parents=True, exist_ok=True)
         cut_log(log_path(options.out), watcher.iteration)
+        if options.imitation is not None:
+            watcher.imitate(world, options.imitation)
         # With counters that go on, stable-baselines3 adds the steps to those done.
-        model.learn(options.steps - model.num_timesteps, callback=watcher, reset_num_timesteps=state is None)
+        fresh = model.num_timesteps == 0
+        model.learn(options.steps - model.num_timesteps, callback=watcher, reset_num_timesteps=fresh)
         watcher.save()
     return options.out
 
@@ -186,12 +190,14 @@ class _Watcher(BaseCallback):
     def __init__(
         self,
         options: TrainingOptions,
+        model: PPO,
         curriculum: Curriculum,
         env: VecNormalize,
         engine: str,
         on_progress: Callable[[Progress], None] | None,
     ) -> None:
         super().__init__()
+        self.model = model
         self._options, self._curriculum, self._env, self._engine = options, curriculum, env, engine
         self._on_progress = on_progress
         batch = options.hyperparameters.batch
@@ -204,7 +210,34 @@ class _Watcher(BaseCallback):
         self._begun = (time.perf_counter(), 0)
         """When training began or was resumed, and at which step."""
 
-    def restore(self, model: PPO, state: TrainingState) -> None:
+    def imitate(self, world: TubeWorld, imitation: Imitation) -> None:
+        """Take the rounds of imitation that are not done yet; afterwards the normalisation stays as it is.
+
+        A resumed imitation begins with an empty memory, which its first rounds fill.
+        """
+        hyper, seed = self._options.hyperparameters, _seed_of(self._options.seed, self.iteration)
+        if self.iteration < imitation.rounds:
+            imitator = Imitator(world, self._env, self.model.policy, hyper, imitation, seed)
+            self._begun = (time.perf_counter(), self.model.num_timesteps)
+            while self.iteration < imitation.rounds:
+                imitator.round(self.iteration, self._means.add)
+                self.model.num_timesteps += hyper.batch
+                self.num_timesteps = self.model.num_timesteps
+                self._report()
+                self.save()
+        self._env.training = False
+
+    def _touch_policy(self) -> None:
+        """Let PPO touch the policy, once the value network has learnt to judge what imitation left."""
+        imitation = self._options.imitation
+        if imitation is None:
+            return
+        touched = self.iteration >= imitation.rounds + imitation.critic_rounds
+        policy = self.model.policy
+        for parameter in (*policy.mlp_extractor.policy_net.parameters(), *policy.action_net.parameters()):
+            parameter.requires_grad = touched
+
+    def restore(self, state: TrainingState) -> None:
         """Go on where a state stood.
 
         Raises:
@@ -215,9 +248,10 @@ class _Watcher(BaseCallback):
                 f"{state_path(self._options.out)}: expected a training that is not over, found {state.steps} of "
                 f"{self._options.steps} steps done; ask for more steps in all"
             )
+        model = self.model
         model.policy.load_state_dict(state.policy)
         model.policy.optimizer.load_state_dict(state.optimiser)
-        model.num_timesteps = state.steps
+        model.num_timesteps = self.num_timesteps = state.steps
         seen = self._env.obs_rms
         seen.mean, seen.var, seen.count = state.mean.numpy(), state.variance.numpy(), state.count
         self._curriculum.restore(state.level, state.results, state.passed)
@@ -239,15 +273,21 @@ class _Watcher(BaseCallback):
         # Before a batch, not after it: then the update that belongs to the last batch is done.
         if self.iteration > self._saved:
             self.save()
+        self._touch_policy()
 
     def _on_rollout_end(self) -> None:
-        self.iteration += 1
-        progress = self._progress()
+        progress = self._report()
         for name in ("level", "success_rate", "mean_return", "mean_steps", "timeout_rate"):
             self.logger.record(f"tube/{name}", getattr(progress, name))
+
+    def _report(self) -> Progress:
+        """Count an iteration, and tell the log and the caller where training stands."""
+        self.iteration += 1
+        progress = self._progress()
         append_log(log_path(self._options.out), progress)
         if self._on_progress is not None:
             self._on_progress(progress)
+        return progress
 
     def _progress(self) -> Progress:
         then, before = self._begun
@@ -311,6 +351,7 @@ class _Watcher(BaseCallback):
                 "privileged": options.world.privileged,
                 "tubes": [asdict(recipe) for recipe in options.tubes],
                 "hyperparameters": asdict(hyper),
+                "imitation": options.imitation and asdict(options.imitation),
                 "versions": _versions(),
             },
             lags=options.world.lags,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from agent_client.settings import DEFAULT_DT
+from agent_client.teacher import TeacherOptions
 from agent_client.tubes import PAPER_TUBES, POOL_SIZE, TubeRecipe
 from agent_client.world import WorldOptions
 
@@ -48,6 +49,28 @@ class Hyperparameters:
 
 
 @dataclass(frozen=True)
+class Imitation:
+    """How a policy imitates the teacher (`agent_client.imitation`) before PPO goes on with it. Our addition."""
+
+    rounds: int = 100
+    """Iterations: each flies one batch of control steps and then learns from the samples kept so far."""
+    teacher: TeacherOptions = field(default_factory=TeacherOptions)
+    takeover: int = 8
+    """Rounds over which the share of lanes that the teacher flies falls from all to none."""
+    memory: int = 600_000
+    """Samples kept."""
+    minibatch: int = 2048
+    updates: int = 80
+    """Minibatches a round."""
+    learning_rate: float = 1e-3
+    final_learning_rate: float = 2e-5
+    normalised_rounds: int = 5
+    """Rounds that the observation's statistics are taken from; afterwards they stay."""
+    critic_rounds: int = 8
+    """Iterations of PPO in which the value network learns alone, before the policy is touched."""
+
+
+@dataclass(frozen=True)
 class TrainingOptions:
     """What to train, for how long, and where to put it."""
 
@@ -70,6 +93,10 @@ class TrainingOptions:
     """Tubes of each level, drawn from training's domain before the first step."""
     replay: float = 0.0
     """Share of episodes from earlier levels (`agent_client.curriculum`)."""
+    imitation: Imitation | None = None
+    """How it imitates a teacher first; its rounds count as iterations and their steps as steps."""
+    first_level: int = 0
+    """Level that the curriculum begins at."""
     threads: int = 2
     """Torch's threads. The policy's bits depend on it."""
     tensorboard: Path | None = None

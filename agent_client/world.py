@@ -114,12 +114,15 @@ class TubeWorld:
         self._resets = ResetBatch.zeros(lanes)
         defaults = session.description.defaults
         self._resets.parameters[:, : len(defaults)] = defaults
-        self._drawn: Records = np.zeros(lanes, DRAWN)
+        self.drawn: Final[Records] = np.zeros(lanes, DRAWN)
+        """Conditions of the lanes' episodes."""
         self._level: Ints = np.zeros(lanes, dtype=np.int64)
         self._returns = np.zeros(lanes)
         self.seed(seed)
         self.state: TaskStep
         """The task's last step, after `restart`."""
+        self.poses: PoseBatch
+        """The poses that it came from."""
 
     def seed(self, seed: int) -> None:
         """Begin the draws anew, with a whole number from 0 to 2^64 - 1."""
@@ -159,7 +162,7 @@ class TubeWorld:
             Observations (N, W); everything else is in `state`.
         """
         decode(actions, self.state.frame, self._table.local, self._table.speed, self._commands.raw)
-        poses = self.session.step(self._path.send(self._commands, self.state))
+        poses = self.poses = self.session.step(self._path.send(self._commands, self.state))
         state = self.state = self._task.observe(poses)
         self._history.push(state.observation)
         self._returns += state.reward
@@ -179,10 +182,10 @@ class TubeWorld:
         seeds = np.full((len(lanes), 2), self._seed, dtype=np.uint64)
         seeds[:, 1] = np.arange(self._episode, self._episode + len(lanes))
         self._episode += len(lanes)
-        drawn = self._drawn[lanes] = draw_conditions(options.conditions, seeds)
+        drawn = self.drawn[lanes] = draw_conditions(options.conditions, seeds)
         apply_parameters(self._resets, lanes, drawn)
         draw_starts(self._resets, lanes, self.geometry, options.settings.start, rng)
-        poses = self.session.reset(self._resets)
+        poses = self.poses = self.session.reset(self._resets)
         state = self.state = self._task.begin(lanes, poses, drawn)
         self._path.begin(lanes, drawn, state, self._commands)
         self._history.begin(lanes, state.observation, state.episodes["observation_delay"])
@@ -194,5 +197,5 @@ class TubeWorld:
         seen = self._history.stack()
         if not self.options.privileged:
             return seen.copy()
-        hidden = privileged(self.state, poses, self._drawn, self.geometry)
+        hidden = privileged(self.state, poses, self.drawn, self.geometry)
         return np.concatenate([seen, hidden], axis=1)

@@ -34,6 +34,7 @@ ONE_IMPORTER = {
 LEARNING_FILES = {
     "agent_client/environment.py",
     "agent_client/gym_env.py",
+    "agent_client/imitation.py",
     "agent_client/training.py",
     "agent_client/training_state.py",
     "agent_client/sb3_policy.py",
