@@ -10,7 +10,7 @@ from typing import Final, Literal, TypeAlias
 
 from agent_client.conditions import Conditions
 from agent_client.settings import RewardSettings, Settings
-from agent_client.training_options import Hyperparameters, TrainingOptions
+from agent_client.training_options import Hyperparameters, Imitation, TrainingOptions
 from agent_client.tubes import HARD_TUBES, PAPER_TUBES, VARIED_TUBES
 from agent_client.world import WorldOptions
 
@@ -56,10 +56,12 @@ the passes over each batch at a higher learning rate."""
 ROBUST: Final = TrainingOptions(
     _OUT,
     preset="robust",
-    steps=3_000_000,
+    steps=2_600_000,
     seed=1,
     world=WorldOptions(
-        Settings(masked_features=UNKNOWN_TUBE, reward=RewardSettings(per_metre=True, centring=3.0)),
+        Settings(
+            masked_features=UNKNOWN_TUBE, reward=RewardSettings(per_metre=True, centring=3.0, failure=-200.0)
+        ),
         Conditions(
             body_radius=(0.15, 0.25),
             field_of_view=(0.6, 1.0),
@@ -69,15 +71,29 @@ ROBUST: Final = TrainingOptions(
             gain=(1.3, 8.0),
             compensation=(0.78, 1.07),
         ),
-        lags=(0,),
+        lags=(0, 1, 2, 3, 4, 6, 8),
         privileged=True,
     ),
-    hyperparameters=Hyperparameters(final_learning_rate=3e-5),
+    hyperparameters=Hyperparameters(
+        learning_rate=2e-4,
+        final_learning_rate=1e-5,
+        lanes=130,
+        rollout=100,
+        minibatch=2600,
+        epochs=5,
+        entropy=0.0,
+        clip=0.2,
+    ),
     tubes=(VARIED_TUBES, HARD_TUBES),
-    replay=0.3,
+    replay=0.35,
+    first_level=2,
+    imitation=Imitation(rounds=100),
 )
-"""The shipped policy's: inertia with randomised dynamics, noise, narrow view, tight bends and varied tubes; the
-policy sees neither its place in the tube nor its progress, the value network sees what was drawn."""
+"""The shipped policy's: inertia with randomised dynamics, noise, narrow view, tight bends and varied tubes. It
+imitates a teacher for the first half and goes on by PPO; no curriculum, whose levels cost nothing but time here.
+The policy sees seven observations of the last 0.8 s, and neither its place in the tube nor its progress; the value
+network sees what was drawn. PPO alone, with the same history and value network, stopped at 94 % of the hard tubes
+of level 2 after 3 M steps."""
 
 PRESETS: Final[Mapping[str, Preset]] = MappingProxyType(
     {
