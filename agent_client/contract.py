@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from agent_client.actions import action_table
 from agent_client.errors import ContractMismatch, Difference, PolicyError
-from agent_client.features import FEATURE_NAMES
+from agent_client.features import FEATURE_NAMES, MEMORY_FEATURES
 from agent_client.history import LAG_MAX, PRESENT
 from agent_client.settings import DEFAULT_DT, Settings
 
@@ -154,11 +154,15 @@ def from_json(text: str, name: str) -> Contract:
 def compare(contract: Contract, running: Contract) -> tuple[Difference, ...]:
     """Every disagreement between a checkpoint's contract and what runs, in the order of the contract.
 
-    Normalisation, mask, network and training are the policy's own and are not compared.
+    Normalisation, mask, network and training are the policy's own and are not compared. Neither is the memory where
+    all of its features are masked, so that the policy sees nothing of it.
     """
     expected, found = _terms(contract), _terms(running)
+    forgetful = set(MEMORY_FEATURES) <= set(contract.masked)
     differences = []
     for name in [*expected, *(n for n in found if n not in expected)]:
+        if forgetful and name.startswith("memory."):
+            continue
         wanted, got = expected.get(name, _ABSENT), found.get(name, _ABSENT)
         if not _same(wanted, got):
             differences.append(Difference(name, _show(wanted), _show(got)))

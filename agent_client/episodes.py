@@ -107,6 +107,7 @@ def constants(settings: Settings, dt: float, *, clearance_contact: bool, on_cont
         "warmup_steps": s.reward.warmup_steps,
         # Length over which the per-step terms of the reward are paid; 0 for the literal reward.
         "reward_length": s.speed_max * dt if s.reward.per_metre else 0.0,
+        "reward_regimes": float(s.reward.regimes),
         "reward_centring": s.reward.centring,
         "reward_success": s.reward.success,
         "reward_failure": s.reward.failure,

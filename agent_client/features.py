@@ -98,6 +98,15 @@ FEATURES: Final[tuple[Feature, ...]] = tuple(
 FEATURE_NAMES: Final = tuple(feature.name for feature in FEATURES)
 
 
+def _names_of(section: str) -> tuple[str, ...]:
+    return tuple(feature.name for feature in FEATURES if feature.section == section)
+
+
+LIDAR_FEATURES: Final = _names_of(_LIDAR)
+CAMERA_FEATURES: Final = _names_of(_CAMERA)
+MEMORY_FEATURES: Final = _names_of(_MEMORY)
+
+
 def feature_mask(masked: Sequence[str]) -> Singles:
     """Factors of the features, (37,): 0 for the named ones, 1 for the others.
 
@@ -146,7 +155,7 @@ def compute_features(
         o[20] = 2.0 * e.progress - 1.0
         o[27] = 2.0 * e.target_distance / constant.depth_scale - 1.0 if e.target_visible else 1.0
         o[28] = 1.0 if e.target_visible else -1.0
-        o[29] = 2.0 * e.memory_age / constant.memory_steps - 1.0
+        o[29] = 2.0 * e.memory_age / max(constant.memory_steps, 1.0) - 1.0
         o[33] = 1.0 if e.memory_available else -1.0
         o[34] = (e.l_min * constant.lidar_reach - e.body_radius) / constant.safety_scale
         o[35] = 1.0 if e.inside else -1.0

@@ -83,11 +83,12 @@ def score(lanes: Ints, episodes: Records, constants: Records) -> None:
         g, imbalance = e.gain, abs(e.S_F - e.S_R)
         terms[1] = g * 0.6 * (1.0 - 0.4 * e.C_turn) * e.S_F
         terms[2] = g * 0.4 * (1.0 + 0.4 * e.C_turn) * e.S_R
-        if e.regime == 1:
+        regime = np.int64(e.regime) if constant.reward_regimes > 0.0 else 3
+        if regime == 1:
             terms[0] = g * e.alignment
             terms[3] = g * 0.4 * e.mu_F
             terms[4] = g * 0.3 * (1.0 - abs(e.h_f))
-        elif e.regime == 2:
+        elif regime == 2:
             terms[0] = g * e.alignment
             terms[4] = g * 0.4 * (1.0 - abs(e.h_f))
             terms[5] = g * 0.3 * (1.0 - abs(e.v_f))

@@ -60,7 +60,7 @@ class MemorySettings:
     """The directional memory (paper, Memory Mechanism)."""
 
     steps: int = 20
-    """Control steps for which a direction that is no longer seen is remembered. Our choice."""
+    """Control steps for which a direction that is no longer seen is remembered; 0 for no memory. Our choice."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +115,9 @@ class RewardSettings:
     per_metre: bool = True
     """Multiply the per-step terms by the step's progress over v_max dt. A departure from the paper, whose
     literal reward (False) pays for time in the tube and so teaches loitering."""
+    regimes: bool = True
+    """Pay the terms of the paper's three cases by what is seen. False, for comparison: those of its case 3, blind
+    navigation, always, so that nothing is paid for alignment."""
     warmup_steps: int = 10
     """t_warmup: control steps with the warm-up bonus. Our choice: the first second."""
     centring: float = 0.0
@@ -192,7 +195,7 @@ def _rules(s: Settings) -> tuple[tuple[str, object, str, bool], ...]:
         ),
         ("camera.target_distance", s.camera.target_distance, "above 0 m", s.camera.target_distance > 0.0),
         ("camera.depth_scale", s.camera.depth_scale, "above 0 m", s.camera.depth_scale > 0.0),
-        ("memory.steps", s.memory.steps, "at least 1 step", s.memory.steps >= 1),
+        ("memory.steps", s.memory.steps, "at least 0 steps", s.memory.steps >= 0),
         ("actions.spread", s.actions.spread, "in (0, 1]", 0.0 < s.actions.spread <= 1.0),
         ("actions.speeds", speeds, "ascending speeds above 0 m/s", _ascending(speeds)),
         ("motion.heading_blend", s.motion.heading_blend, "in (0, 1]", 0.0 < s.motion.heading_blend <= 1.0),

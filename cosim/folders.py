@@ -1,17 +1,22 @@
-"""Run folders: where a run goes when nobody says, and refusing what cannot be written."""
+"""Folders of runs and results: where a run goes when nobody says, and refusing what cannot be written."""
 
 from __future__ import annotations
 
 import itertools
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any, Final
 
 from cosim.errors import PEER, OutputError, exit_status
 from cosim.recording import LOG, MANIFEST
 from cosim.supervise import LOGS
+
+RESULTS: Final = "results.json"
+"""File of what many flights came to."""
 
 
 def check_folder(out: Path | None) -> None:
@@ -57,6 +62,43 @@ def new_folder(out: Path | None, label: str) -> Iterator[Path]:
                 (folder / name).unlink(missing_ok=True)
             remove_empty(made)
         raise
+
+
+@contextmanager
+def results_folder(folder: Path | None) -> Iterator[None]:
+    """Create the folder of the results before all the flying; what was made goes again where that fails.
+
+    Raises:
+        OutputError: it holds results already, or cannot be written.
+    """
+    if folder is None:
+        yield
+        return
+    if (folder / RESULTS).exists():
+        raise OutputError(
+            f"--out {folder}: expected a folder without {RESULTS}, found one; name another folder"
+        )
+    _, made = make_folder(folder)
+    try:
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise OutputError(f"--out {folder}: expected a folder that can be written, found one that cannot")
+        yield
+    except BaseException:
+        remove_empty(made)
+        raise
+
+
+def write_results(folder: Path, report: dict[str, Any]) -> None:
+    """Write the results into their folder.
+
+    Raises:
+        OutputError: they cannot be written.
+    """
+    path = folder / RESULTS
+    try:
+        path.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def remove_empty(folders: list[Path]) -> None:

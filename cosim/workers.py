@@ -1,4 +1,4 @@
-"""Flying many episodes at once: jobs, and the processes that do them.
+"""Flying many episodes and training many policies at once: jobs, and the processes that do them.
 
 One file holds all that is parallel. A job says everything that its result depends on, so that it does not matter
 who does it. Each worker has at most one physics server, for one lane: lanes whose episode is over would cost as
@@ -11,6 +11,7 @@ import atexit
 import itertools
 import multiprocessing
 import os
+import shutil
 import signal
 import tempfile
 import threading
@@ -18,20 +19,25 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from multiprocessing.connection import wait
+from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
 from agent_client.conditions import Conditions
 from agent_client.evaluation import Episode, EpisodeResult, fly_episodes
 from agent_client.kinematic import KinematicPlant
+from agent_client.training_log import Progress
+from agent_client.training_options import TrainingOptions
 from agent_client.tubes import TubeRecipe
 from agent_client.tuning import Tuning, tune_pure_pursuit
-from cosim.errors import PEER, TERMINATED, WorkerError, exit_status
+from cosim.errors import PEER, TERMINATED, OutputError, WorkerError, exit_status
+from cosim.live import counting
 from cosim.options import DEFAULT_PHYSICS_DT
 from cosim.pilots import ANY_DRONE, Pilot, PilotChoice, Terms, read_pilot
 from cosim.sessions import server_session
+from cosim.train import load_training
 from cosim.walls import WallRegistry
 from physics_server.reference import ReferencePlant
 from protocol.agent import AgentSession, SessionSettings
@@ -82,11 +88,27 @@ class TuneJob:
         return 10 * self.episodes
 
 
-Job: TypeAlias = FlyJob | TuneJob
+@dataclass(frozen=True)
+class TrainJob:
+    """Training a policy, in a world of this process; its checkpoint and its log are written when it is complete."""
+
+    options: TrainingOptions
+    engine: Engine
+    """Not `bullet`."""
+
+    @property
+    def weight(self) -> int:
+        """Control steps."""
+        return self.options.steps
+
+
+Job: TypeAlias = FlyJob | TuneJob | TrainJob
 Flown: TypeAlias = tuple[tuple[EpisodeResult, ...], ...]
 """Results of a FlyJob: those of each pilot, in the order of its episodes."""
+Trained: TypeAlias = tuple[Progress, ...]
+"""Log of a TrainJob: a row an iteration."""
 RunJobs: TypeAlias = Callable[[Sequence[Job]], Iterator[Any]]
-"""Does jobs and yields their results in their order: Flown for a FlyJob, Tuning for a TuneJob."""
+"""Does jobs and yields their results in their order: Flown for a FlyJob, Tuning, Trained."""
 
 
 class Worker:
@@ -97,12 +119,15 @@ class Worker:
         self._session: AgentSession | None = None
         self._walls = WallRegistry(WALLS)
 
-    def do(self, job: Job) -> Flown | Tuning:
+    def do(self, job: Job) -> Flown | Tuning | Trained:
         """Do a job.
 
         Raises:
             ProtocolError: the physics server failed; what it said last is a note of the error.
+            CosimError: training is not installed, or its files cannot be written.
         """
+        if isinstance(job, TrainJob):
+            return _train(job)
         if isinstance(job, TuneJob):
             return _tune(job)
         pilots = [_pilot(choice) for choice in job.pilots]
@@ -181,6 +206,24 @@ def _tune(job: TuneJob) -> Tuning:
     )
 
 
+def _train(job: TrainJob) -> Trained:
+    log: list[Progress] = []
+    run, out = load_training(), job.options.out
+    with tempfile.TemporaryDirectory(prefix="cosim-train-") as scratch:
+        path = run(
+            replace(job.options, out=Path(scratch) / out.name),
+            log.append,
+            lambda settings: open_world(job.engine, settings.lanes, settings.dt),
+        )
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            for suffix in (".csv", ".zip"):
+                shutil.move(path.with_suffix(suffix), out.with_suffix(suffix))
+        except OSError as error:
+            raise OutputError(f"{out} cannot be written: {error.strerror}") from error
+    return tuple(log)
+
+
 @lru_cache(maxsize=32)
 def _pilot(choice: PilotChoice) -> Pilot:
     return read_pilot(choice, Terms(allowed=ANY_DRONE))
@@ -218,9 +261,30 @@ def crew(workers: int) -> Iterator[RunJobs]:
             yield run
             executor.shutdown()
         except BrokenProcessPool as error:
-            raise WorkerError("a worker process was killed, or died; nothing was evaluated", PEER) from error
+            raise WorkerError("a worker process was killed, or died; there is no result", PEER) from error
         finally:
             _end(executor)
+
+
+def do_jobs(
+    run: RunJobs, jobs: Sequence[Job], what: str, tell: Callable[[int, Any], None] | None = None
+) -> list[Any]:
+    """Results of jobs, with a bar while they are done.
+
+    Args:
+        run: from `crew`.
+        jobs: to be done.
+        what: is done, for the bar.
+        tell: is told the index and the result of each job, in their order.
+    """
+    results: list[Any] = []
+    with counting(what, sum(job.weight for job in jobs)) as advance:
+        for job, result in zip(jobs, run(jobs), strict=True):
+            advance(job.weight)
+            if tell is not None:
+                tell(len(results), result)
+            results.append(result)
+    return results
 
 
 def _end(executor: ProcessPoolExecutor) -> None:
@@ -264,7 +328,7 @@ def _begin(folder: str) -> None:
     threading.Thread(target=follow_parent, daemon=True).start()
 
 
-def _do(job: Job) -> Flown | Tuning:
+def _do(job: Job) -> Flown | Tuning | Trained:
     """Do a job in a worker process; what was raised on purpose travels as a sentence and an exit status."""
     assert _worker is not None
     try:
