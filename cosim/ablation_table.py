@@ -43,10 +43,11 @@ def _wrapped(lines: Iterator[str]) -> Iterator[str]:
 
 
 def _heading(report: Row) -> Iterator[str]:
-    seeds = report["seeds"]
+    first, last = report["seeds"][0], report["seeds"][-1]
+    seeds = f"seed {first}" if first == last else f"seeds {first} to {last}"
     yield (
-        f"preset '{report['preset']}', {report['steps']:,} steps, {len(seeds)} seeds from {seeds[0]}; "
-        f"{report['episodes']} unseen tubes a level, the same for all (seed {report['seed']}), trained and flown "
+        f"preset '{report['preset']}', {report['steps']:,} steps, {seeds}; "
+        f"{report['episodes']} unseen tubes a level, the same for all (of seed {report['seed']}), trained and flown "
         f"{WORLDS[report['engine']]}"
     )
     if report["imitation"]:

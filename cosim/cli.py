@@ -154,7 +154,10 @@ def evaluate(as_json: bool, **options: Any) -> None:
 @cosim.command(short_help="Train without memory, camera, curriculum and so on, and compare.")
 @click.option("--variants", metavar="A,B,...", help="Only these [default: all].")
 @click.option(
-    "--preset", type=click.Choice(["paper", "quick", "robust"]), default="quick", help="[default: quick]"
+    "--preset",
+    type=click.Choice(["paper", "quick", "robust"]),
+    default="quick",
+    help="Recipe [default: quick].",
 )
 @click.option(
     "--dynamics", type=click.Choice(["kinematic", "rigid-body"]), help="World [default: the preset's]."
