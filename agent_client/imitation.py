@@ -105,7 +105,8 @@ class Imitator:
         for t in range(self._hyper.rollout):
             command = self._teacher.command(world.state, world.poses, world.drawn)
             batch[t] = self._observation
-            self._memory.add(self._observation[:, : self._seen], command.astype(np.float32))
+            knows = (world.state.frame[:, 0] * world.state.axis.tangent).sum(axis=1) > self._options.facing
+            self._memory.add(self._observation[knows, : self._seen], command[knows].astype(np.float32))
             taught = ((command[:, None] - velocities[None]) ** 2).sum(axis=2).argmin(axis=1)
             actions = np.where(self._rng.random(lanes) < share, taught, self._decide())
             step = world.step(actions)

@@ -4,12 +4,15 @@ It wants the velocity v* towards the point of the axis `lookahead` ahead, at the
 
     w = v* + (lead / k_v) (v* - V) + (1 - c) g / k_v z
 
-which under F = m k_v (w - V) + c m g - m g makes V go to v* with the gain (1 + lead / k_v) k_v, and not sink. An
-action's merit is how near its velocity comes to w. Pure Pursuit is the same without the last two terms.
+which under F = m k_v (w - V) + c m g - m g makes V go to v* with the gain (1 + lead / k_v) k_v, and not sink. The
+drone turns its nose, and with it its sensors, along w: where w would point further than `cone` from v* it is made
+longer along v*, since who learns from noses that point backwards turns back. An action's merit is how near its
+velocity comes to w. Pure Pursuit is w = v*.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -25,6 +28,9 @@ from protocol.plant import PoseBatch
 
 Floats = NDArray[np.float64]
 
+SLOWEST: Final = 0.2
+"""Least component of w along v* (m/s)."""
+
 GRAVITY: Final = 9.81
 """The plant's default (m/s^2)."""
 
@@ -37,7 +43,9 @@ class TeacherOptions:
     """Arc length ahead (m)."""
     lead: float = 2.0
     """How much faster than the plant the velocity is corrected (1/s)."""
-    sharpness: float = 8.0
+    cone: float = math.radians(60.0)
+    """Greatest angle between w and v* (rad)."""
+    sharpness: float = 16.0
     """How sharply its choice among actions falls off with the square of what they miss w by (s^2/m^2)."""
 
 
@@ -70,10 +78,15 @@ class Teacher:
         targets, tangents = self._geometry.axis(ahead)
         beyond = np.maximum(ahead - self._geometry.length, 0.0)[:, None]
         way = targets + beyond * tangents - step.position
-        wanted = self._speed_max * way / np.linalg.norm(way, axis=1, keepdims=True)
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        wanted = self._speed_max * way
         gain = drawn["gain"][:, None]
         command = wanted + lead / gain * (wanted - poses.linear_velocity)
         command[:, 2] += (1.0 - drawn["compensation"]) * GRAVITY / drawn["gain"]
+        along = (command * way).sum(axis=1, keepdims=True)
+        across = command - along * way
+        least = np.linalg.norm(across, axis=1, keepdims=True) / math.tan(self._options.cone) + SLOWEST
+        command = across + np.maximum(along, least) * way
         local: Floats = np.einsum("nij,nj->ni", step.frame, command)
         local *= np.minimum(1.0, self._speed_max / np.linalg.norm(local, axis=1, keepdims=True))
         return local

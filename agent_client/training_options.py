@@ -59,6 +59,9 @@ class Imitation:
     """Rounds over which the share of lanes that the teacher flies falls from all to none."""
     memory: int = 600_000
     """Samples kept."""
+    facing: float = -0.5
+    """Samples are kept where the cosine between heading and axis is above this. Nobody can tell by its sensors that
+    it flies back in a tube: to be taught to turn there is to be taught to turn anywhere."""
     minibatch: int = 2048
     updates: int = 80
     """Minibatches a round."""
