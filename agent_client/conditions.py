@@ -202,7 +202,7 @@ def _place(values: Floats, bounds: Floats, whole: NDArray[np.bool_]) -> None:
 
 def _values(drawn: Records) -> Floats:
     """The conditions in records of DRAWN as a view (K, C), in the order of the table."""
-    return drawn.view(np.float64).reshape(len(drawn), -1)[:, : len(NAMES)]
+    return drawn.view(np.float64).reshape(len(drawn), len(NAMES) + 1)[:, : len(NAMES)]
 
 
 def apply_parameters(resets: ResetBatch, lanes: NDArray[np.int64], drawn: Records) -> None:

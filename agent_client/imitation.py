@@ -60,6 +60,7 @@ class Imitator:
         policy: stable-baselines3's actor-critic policy; its actor learns, its critic is left alone.
         hyper: PPO's numbers; a round is one of its batches.
         options: how to imitate.
+        rounds: how many there will be.
         seed: of the draws from the memory and of the takeover.
     """
 
@@ -70,15 +71,17 @@ class Imitator:
         policy: Any,
         hyper: Hyperparameters,
         options: Imitation,
+        rounds: int,
         seed: int,
     ) -> None:
         self._world, self._env, self._hyper, self._options = world, env, hyper, options
+        self._rounds = rounds
         self._actor = torch.nn.Sequential(policy.mlp_extractor.policy_net, policy.action_net)
         self._seen = policy.mlp_extractor.policy_net[0].in_features
         self.optimiser = torch.optim.Adam(self._actor.parameters(), lr=options.learning_rate, fused=True)
         self._teacher = Teacher(world.geometry, world.options.settings, options.teacher)
         self._velocities = torch.from_numpy(self._teacher.velocities.astype(np.float32))
-        self._memory = Memory(min(options.memory, options.rounds * hyper.batch), self._seen)
+        self._memory = Memory(min(options.memory, rounds * hyper.batch), self._seen)
         self._rng = np.random.default_rng(seed)
         self._observation = world.restart()
 
@@ -91,7 +94,7 @@ class Imitator:
         """
         share = max(0.0, 1.0 - number / self._options.takeover)
         self._fly(share, number < self._options.normalised_rounds, on_episode)
-        spent = number / self._options.rounds
+        spent = number / self._rounds
         first, last = self._options.learning_rate, self._options.final_learning_rate
         for group in self.optimiser.param_groups:
             group["lr"] = first + (last - first) * spent

@@ -53,53 +53,61 @@ QUICK: Final = TrainingOptions(
 """Past the paper's table in the least time: the paper's task, with its reward paid per metre of progress, and half
 the passes over each batch at a higher learning rate."""
 
+_BROAD: Final = Conditions(
+    body_radius=(0.15, 0.25),
+    field_of_view=(0.6, 1.0),
+    lidar_noise=(0.0, 0.03),
+    lidar_dropout=(0.0, 0.03),
+    camera_dropout=(0.0, 0.2),
+    gain=(1.3, 8.0),
+    compensation=(0.78, 1.07),
+)
+
+_SOFT: Final = replace(_BROAD, gain=(1.3, 3.0), compensation=(0.78, 0.92))
+"""Every other episode: a soft drone that sinks, where flights fail first and which even draws seldom give."""
+
 ROBUST: Final = TrainingOptions(
     _OUT,
     preset="robust",
-    steps=2_600_000,
+    steps=1_300_000,
     seed=1,
     world=WorldOptions(
-        Settings(
-            masked_features=UNKNOWN_TUBE, reward=RewardSettings(per_metre=True, centring=3.0, failure=-200.0)
-        ),
-        Conditions(
-            body_radius=(0.15, 0.25),
-            field_of_view=(0.6, 1.0),
-            lidar_noise=(0.0, 0.03),
-            lidar_dropout=(0.0, 0.03),
-            camera_dropout=(0.0, 0.2),
-            gain=(1.3, 8.0),
-            compensation=(0.78, 1.07),
-        ),
-        lags=(0, 1, 2, 3, 4, 6, 8),
-        privileged=True,
+        Settings(masked_features=UNKNOWN_TUBE, reward=RewardSettings(per_metre=True, centring=3.0)),
+        _BROAD,
+        rotation=(_SOFT,),
+        lags=(0, 1, 2, 3, 4, 6, 8, 12, 16),
     ),
-    hyperparameters=Hyperparameters(
-        learning_rate=2e-4,
-        final_learning_rate=1e-5,
-        lanes=130,
-        rollout=100,
-        minibatch=2600,
-        epochs=5,
-        entropy=0.0,
-        clip=0.2,
-    ),
+    hyperparameters=Hyperparameters(lanes=130, rollout=100),
     tubes=(VARIED_TUBES, HARD_TUBES),
     replay=0.35,
     first_level=2,
-    imitation=Imitation(rounds=100),
+    imitation=Imitation(),
 )
-"""The shipped policy's: inertia with randomised dynamics, noise, narrow view, tight bends and varied tubes. It
-imitates a teacher for the first half and goes on by PPO; no curriculum, whose levels cost nothing but time here.
-The policy sees seven observations of the last 0.8 s, and neither its place in the tube nor its progress; the value
-network sees what was drawn. PPO alone, with the same history and value network, stopped at 94 % of the hard tubes
-of level 2 after 3 M steps."""
+"""The shipped policy's: inertia with randomised dynamics, noise, narrow view, tight bends and varied tubes. The
+policy sees nine observations of the last 1.6 s, and neither its place in the tube nor its progress. It is no PPO:
+it imitates a teacher that sees the axis and the hidden dynamics, in place of a curriculum at all levels at once.
+Trials of PPO, alone (`robust-ppo`) or going on from here, ended lower on the hard tubes; the README has figures."""
+
+ROBUST_PPO: Final = replace(
+    ROBUST,
+    preset="robust-ppo",
+    steps=3_003_000,
+    world=replace(ROBUST.world, rotation=(), privileged=True),
+    hyperparameters=Hyperparameters(final_learning_rate=3e-5),
+    replay=0.3,
+    first_level=0,
+    imitation=None,
+)
+"""The same task by PPO through the curriculum, with a value network that sees the axis and the hidden dynamics."""
 
 PRESETS: Final[Mapping[str, Preset]] = MappingProxyType(
     {
         "paper": Preset("the paper's task, reward and hyperparameters", "kinematic", PAPER),
         "quick": Preset("above the paper's success rates in the least time", "kinematic", QUICK),
-        "robust": Preset("the shipped policy: inertia, noise, hard tubes", "rigid-body", ROBUST),
+        "robust": Preset(
+            "the shipped policy: inertia, noise, hard tubes; by imitation", "rigid-body", ROBUST
+        ),
+        "robust-ppo": Preset("the same task by PPO alone", "rigid-body", ROBUST_PPO),
     }
 )
 

@@ -1,6 +1,6 @@
 """A teacher that sees what no drone does: the exact axis, its velocity, and the dynamics that were drawn.
 
-It wants the velocity v* towards the point of the axis `lookahead` ahead, at the top speed, and commands
+It wants the velocity v* towards the point of the axis `lookahead` ahead, and commands
 
     w = v* + (lead / k_v) (v* - V) + (1 - c) g / k_v z
 
@@ -41,6 +41,8 @@ class TeacherOptions:
 
     lookahead: float = 0.7
     """Arc length ahead (m)."""
+    speed: float = 0.9
+    """Size of v* as a share of the top speed: what is left over serves corrections."""
     lead: float = 2.0
     """How much faster than the plant the velocity is corrected (1/s)."""
     cone: float = math.radians(60.0)
@@ -79,7 +81,7 @@ class Teacher:
         beyond = np.maximum(ahead - self._geometry.length, 0.0)[:, None]
         way = targets + beyond * tangents - step.position
         way /= np.linalg.norm(way, axis=1, keepdims=True)
-        wanted = self._speed_max * way
+        wanted = self._options.speed * self._speed_max * way
         gain = drawn["gain"][:, None]
         command = wanted + lead / gain * (wanted - poses.linear_velocity)
         command[:, 2] += (1.0 - drawn["compensation"]) * GRAVITY / drawn["gain"]

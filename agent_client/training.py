@@ -9,7 +9,6 @@ After every iteration the checkpoint and the state to go on from are written, so
 from __future__ import annotations
 
 import io
-import math
 import platform
 import time
 from collections.abc import Callable
@@ -113,8 +112,9 @@ def train(
         if options.imitation is not None:
             watcher.imitate(world, options.imitation)
         # With counters that go on, stable-baselines3 adds the steps to those done.
-        fresh = model.num_timesteps == 0
-        model.learn(options.steps - model.num_timesteps, callback=watcher, reset_num_timesteps=fresh)
+        if (left := options.steps - model.num_timesteps) > 0:
+            fresh = model.num_timesteps == 0
+            model.learn(left, callback=watcher, reset_num_timesteps=fresh)
         watcher.save()
     return options.out
 
@@ -200,8 +200,7 @@ class _Watcher(BaseCallback):
         self.model = model
         self._options, self._curriculum, self._env, self._engine = options, curriculum, env, engine
         self._on_progress = on_progress
-        batch = options.hyperparameters.batch
-        self._total = math.ceil(options.steps / batch) * batch
+        self._total = options.iterations * options.hyperparameters.batch
         self._means = EpisodeMeans()
         self.iteration = 0
         """Batches that were collected."""
@@ -215,11 +214,12 @@ class _Watcher(BaseCallback):
 
         A resumed imitation begins with an empty memory, which its first rounds fill.
         """
+        rounds = self._options.rounds
         hyper, seed = self._options.hyperparameters, _seed_of(self._options.seed, self.iteration)
-        if self.iteration < imitation.rounds:
-            imitator = Imitator(world, self._env, self.model.policy, hyper, imitation, seed)
+        if self.iteration < rounds:
+            imitator = Imitator(world, self._env, self.model.policy, hyper, imitation, rounds, seed)
             self._begun = (time.perf_counter(), self.model.num_timesteps)
-            while self.iteration < imitation.rounds:
+            while self.iteration < rounds:
                 imitator.round(self.iteration, self._means.add)
                 self.model.num_timesteps += hyper.batch
                 self.num_timesteps = self.model.num_timesteps
@@ -232,7 +232,7 @@ class _Watcher(BaseCallback):
         imitation = self._options.imitation
         if imitation is None:
             return
-        touched = self.iteration >= imitation.rounds + imitation.critic_rounds
+        touched = self.iteration >= self._options.rounds + imitation.critic_rounds
         policy = self.model.policy
         for parameter in (*policy.mlp_extractor.policy_net.parameters(), *policy.action_net.parameters()):
             parameter.requires_grad = touched
@@ -347,7 +347,7 @@ class _Watcher(BaseCallback):
                 "level": self._curriculum.level,
                 "replay": options.replay,
                 "pool": options.pool,
-                "conditions": asdict(options.world.conditions),
+                "conditions": [asdict(c) for c in (options.world.conditions, *options.world.rotation)],
                 "privileged": options.world.privileged,
                 "tubes": [asdict(recipe) for recipe in options.tubes],
                 "hyperparameters": asdict(hyper),

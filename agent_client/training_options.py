@@ -52,8 +52,9 @@ class Hyperparameters:
 class Imitation:
     """How a policy imitates the teacher (`agent_client.imitation`) before PPO goes on with it. Our addition."""
 
-    rounds: int = 100
-    """Iterations: each flies one batch of control steps and then learns from the samples kept so far."""
+    rounds: int | None = None
+    """Iterations: each flies one batch of control steps and then learns from the samples kept so far. None for all
+    of the training's; after fewer, PPO goes on."""
     teacher: TeacherOptions = field(default_factory=TeacherOptions)
     takeover: int = 8
     """Rounds over which the share of lanes that the teacher flies falls from all to none."""
@@ -104,6 +105,18 @@ class TrainingOptions:
     """Torch's threads. The policy's bits depend on it."""
     tensorboard: Path | None = None
     """Folder for TensorBoard's logs."""
+
+    @property
+    def iterations(self) -> int:
+        """Batches of control steps."""
+        return -(-self.steps // self.hyperparameters.batch)
+
+    @property
+    def rounds(self) -> int:
+        """How many of them imitate."""
+        if self.imitation is None:
+            return 0
+        return self.iterations if self.imitation.rounds is None else self.imitation.rounds
 
 
 def fitting_minibatch(hyper: Hyperparameters) -> int:

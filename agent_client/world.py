@@ -43,6 +43,8 @@ class WorldOptions:
 
     settings: Settings = field(default_factory=Settings)
     conditions: Conditions = field(default_factory=Conditions)
+    rotation: tuple[Conditions, ...] = ()
+    """Further conditions that episodes take in turn with `conditions`, so that rare ones are met more often."""
     lags: tuple[int, ...] = PRESENT
     """Ages of the observations that the policy sees (`agent_client.history`)."""
     privileged: bool = False
@@ -182,7 +184,12 @@ class TubeWorld:
         seeds = np.full((len(lanes), 2), self._seed, dtype=np.uint64)
         seeds[:, 1] = np.arange(self._episode, self._episode + len(lanes))
         self._episode += len(lanes)
-        drawn = self.drawn[lanes] = draw_conditions(options.conditions, seeds)
+        drawn = np.zeros(len(lanes), DRAWN)
+        choices = (options.conditions, *options.rotation)
+        turn = seeds[:, 1] % np.uint64(len(choices))
+        for number, conditions in enumerate(choices):
+            drawn[turn == number] = draw_conditions(conditions, seeds[turn == number])
+        self.drawn[lanes] = drawn
         apply_parameters(self._resets, lanes, drawn)
         draw_starts(self._resets, lanes, self.geometry, options.settings.start, rng)
         poses = self.poses = self.session.reset(self._resets)

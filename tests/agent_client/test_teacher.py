@@ -30,7 +30,7 @@ def commanded(tube: Geometry, velocity: tuple[float, float, float], z: float, **
     poses.linear_velocity[0] = velocity
     step = TubeTask(tube, Settings(), 0.1, clearance_contact=True).begin(np.array([0]), poses)
     drawn = draw_conditions(Conditions(**{name: (value, value) for name, value in ranges.items()}), [(0,)])
-    options = TeacherOptions(lookahead=1.0, lead=2.0)
+    options = TeacherOptions(lookahead=1.0, speed=1.0, lead=2.0)
     return Teacher(tube, Settings(), options).command(step, poses, drawn)[0]
 
 
@@ -68,3 +68,10 @@ def test_it_flies_hard_tubes_under_hard_dynamics() -> None:
             miss = ((command[:, None] - teacher.velocities) ** 2).sum(axis=2)
             world.advance(miss.argmin(axis=1))
         assert (world.state.outcome == Outcome.SUCCESS).all()
+
+
+def test_it_keeps_its_nose_within_the_cone(cylinder: Maker) -> None:
+    """Falling fast down a tube it would command backwards: the command stays within 60 degrees of the way."""
+    found = commanded(cylinder(), (4.0, 0.5, 0.0), 0.3, gain=1.5, compensation=0.8)
+    way = np.array([1.0, -0.3, 0.0]) / np.hypot(1.0, 0.3)
+    assert found @ way / np.linalg.norm(found) >= np.cos(np.radians(60.0)) - 1e-9

@@ -246,3 +246,13 @@ def test_a_plant_with_walls_is_reset_into_the_tubes_and_trusted_with_contact(
 def test_conditions_are_named_as_the_task_knows_them() -> None:
     """What perception works under is a subset of the table's names."""
     assert set(SENSED) < set(NAMES)
+
+
+def test_episodes_take_conditions_in_turn(make_world: Callable[..., TubeWorld]) -> None:
+    """With one further set of conditions every other episode draws from it, and the others from the first."""
+    soft = Conditions(gain=(1.0, 2.0))
+    world = make_world(WorldOptions(conditions=Conditions(gain=(5.0, 6.0)), rotation=(soft,)))
+    world.restart()
+    gains = world.drawn["gain"]
+    assert ((gains[0::2] >= 5.0) & (gains[0::2] <= 6.0)).all()
+    assert ((gains[1::2] >= 1.0) & (gains[1::2] <= 2.0)).all()
