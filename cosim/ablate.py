@@ -180,8 +180,7 @@ def _named(names: Sequence[str] | None) -> list[Ablation]:
 def _base(options: AblateOptions, conditions: Conditions) -> TrainingOptions:
     """The preset with what the user asked.
 
-    It imitates no teacher: one that sees the axis would teach what is taken away. One torch thread, so that the
-    policies are the same however many processes train them.
+    One torch thread, so that the policies are the same however many processes train them.
     """
     base = PRESETS[options.preset].options
     lanes = options.envs or base.hyperparameters.lanes
@@ -190,7 +189,6 @@ def _base(options: AblateOptions, conditions: Conditions) -> TrainingOptions:
         steps=options.steps or base.steps,
         pool=options.pool or base.pool,
         hyperparameters=replace(base.hyperparameters, lanes=lanes),
-        imitation=None,
         threads=1,
     )
     if options.unknown_tube:
@@ -306,7 +304,6 @@ def _report(
         "seed": options.seed,
         "trained_under": base.world.conditions.changed(),
         "flown_under": plan.conditions.changed(),
-        "imitation": "left out" if PRESETS[options.preset].options.imitation else None,
         "left_out": list(plan.left_out),
         "paper": {"success": list(PAPER_SUCCESS)},
         "rows": list(rows),

@@ -50,8 +50,6 @@ def _heading(report: Row) -> Iterator[str]:
         f"{report['episodes']} unseen tubes a level, the same for all (of seed {report['seed']}), trained and flown "
         f"{WORLDS[report['engine']]}"
     )
-    if report["imitation"]:
-        yield "without the preset's imitation, whose teacher would teach what is taken away"
     trained, flown = report["trained_under"], report["flown_under"]
     if trained or flown:
         yield f"trained under: {_ranges(trained)}"

@@ -70,15 +70,19 @@ def export(run: Path, kind: str, output: Path | None) -> None:
     click.echo(write(run, kind, output))
 
 
-@cosim.command(short_help="Train a policy with PPO.")
-@click.option("--preset", type=click.Choice(["paper", "quick", "robust"]), help="Recipe [default: robust].")
+@cosim.command(short_help="Train a policy.")
+@click.option(
+    "--preset",
+    type=click.Choice(["paper", "quick", "robust", "robust-ppo"]),
+    help="Recipe [default: robust].",
+)
 @click.option(
     "--steps", type=click.IntRange(min=1), help="Control steps of all drones [default: the preset's]."
 )
 @click.option(
     "--seed", type=click.IntRange(0, 2**32 - 1), help="Of tubes, starts, network [default: the preset's]."
 )
-@click.option("--envs", type=click.IntRange(min=1), help="Drones side by side [default: 65].")
+@click.option("--envs", type=click.IntRange(min=1), help="Drones side by side [default: the preset's].")
 @click.option("--pool", type=click.IntRange(min=1), help="Tubes a level [default: 1000; fewer with bullet].")
 @click.option(
     "--dynamics", type=click.Choice(["kinematic", "rigid-body"]), help="World [default: the preset's]."
@@ -96,12 +100,13 @@ def export(run: Path, kind: str, output: Path | None) -> None:
     "--explain", is_flag=True, help="Print what the paper leaves open and what 'paper' takes; train nothing."
 )
 def train(out: Path | None, resume: Path | None, explain: bool, **arguments: Any) -> None:
-    """Train a policy with PPO, through the curriculum of the paper, and write it as a checkpoint that flies.
+    """Train a policy and write it as a checkpoint that flies.
 
     \b
-    paper    the paper's task, features, literal reward and hyperparameters
-    quick    above the paper's success rates in the least time
-    robust   the shipped policy's: inertia, noise, hard tubes
+    paper       PPO: the paper's task, features, curriculum, literal reward and hyperparameters
+    quick       PPO: above the paper's success rates in the least time
+    robust      the shipped policy's: inertia, noise, hard tubes; imitates a teacher that sees the axis
+    robust-ppo  the same task by PPO through the curriculum
 
     The folder gets policy.zip, policy.csv (a row an iteration), TensorBoard's logs, success.png and return.png.
     A training that was stopped or killed goes on after its last iteration, with new episodes:
@@ -155,7 +160,7 @@ def evaluate(as_json: bool, **options: Any) -> None:
 @click.option("--variants", metavar="A,B,...", help="Only these [default: all].")
 @click.option(
     "--preset",
-    type=click.Choice(["paper", "quick", "robust"]),
+    type=click.Choice(["paper", "quick", "robust-ppo"]),
     default="quick",
     help="Recipe [default: quick].",
 )
