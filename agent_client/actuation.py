@@ -6,15 +6,12 @@ m k_v (v_cmd d - V) is the same as w added to v_cmd d, which is how the air near
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from agent_client.conditions import DELAY_MAX, NEAR_WALL_REACH
 from agent_client.episodes import Records
-from agent_client.noise import COMMAND, uniform
+from agent_client.noise import blow
 from agent_client.task import TaskStep
 from protocol.plant import CommandBatch
 
@@ -73,28 +70,5 @@ class CommandPath:
         self._ring[self._head] = commands.raw
         sent = self._sent.raw
         sent[:] = self._ring[(self._head - self._delay) % len(self._ring), self._lanes]
-        _blow(step.episodes, self._near_wall, self._speed_max, sent)
+        blow(step.episodes, self._near_wall, NEAR_WALL_REACH, self._speed_max, sent)
         return self._sent
-
-
-@njit(cache=True, error_model="numpy")
-def _blow(episodes: Records, near_wall: Floats, speed_max: float, commands: Floats) -> None:
-    """Add the air's motion, uniform in a cube and growing as the gap to the mean wall closes, to commands (N, 8)."""
-    for i in range(commands.shape[0]):
-        if near_wall[i] <= 0.0:
-            continue
-        e = episodes[i]
-        gap = e.radius - e.radial_distance - e.body_radius
-        strength = near_wall[i] * min(max(1.0 - gap / NEAR_WALL_REACH, 0.0), 1.0)
-        if strength <= 0.0:
-            continue
-        command = commands[i]
-        norm = 0.0
-        for c in range(3):
-            air = strength * (2.0 * uniform(e.noise_seed, e.step, COMMAND + c) - 1.0)
-            command[c] = command[3] * command[c] + air
-            norm += command[c] ** 2
-        norm = math.sqrt(norm)
-        for c in range(3):
-            command[c] = command[c] / norm if norm > 1e-9 else e.frame[0, c]
-        command[3] = min(norm, speed_max)

@@ -16,6 +16,7 @@ from agent_client.flight import fly
 from agent_client.settings import Settings
 from agent_client.task import Outcome
 from agent_client.tubes import PAPER_TUBES, Domain, TubeRecipe, draw_tube
+from meshes.curves import DOMAINS
 from meshes.geometry import Geometry
 from meshes.swept import SweptTube
 from meshes.swept_geometry import SweptGeometry
@@ -100,7 +101,9 @@ def draw_episodes(
         recipe: of their tubes.
         domain: of the tubes' seeds.
     """
-    seeds = np.random.SeedSequence([seed, level]).generate_state(count, np.uint32).tolist()
+    # The domain enters: tuning must not meet the starts and draws of the evaluation of the same seed.
+    words = [seed, level] if domain == "evaluate" else [seed, level, DOMAINS[domain]]
+    seeds = np.random.SeedSequence(words).generate_state(count, np.uint32).tolist()
     return [Episode(level, number, recipe, domain) for number in seeds]
 
 

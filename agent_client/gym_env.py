@@ -88,7 +88,7 @@ class TubeEnvOptions:
     @property
     def world(self) -> WorldOptions:
         """The same, as far as a world needs it."""
-        return WorldOptions(self.settings, self.conditions, self.lags)
+        return WorldOptions(self.settings, self.conditions, lags=self.lags)
 
     def draw(self, level: int, seed: int) -> SweptTube:
         """The tube of a level and a seed."""

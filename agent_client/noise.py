@@ -95,3 +95,34 @@ def blinded(episode: Any) -> bool:
     if episode.camera_dropout <= 0.0:
         return False
     return bool(uniform(episode.noise_seed, episode.step, CAMERA) < episode.camera_dropout)
+
+
+@njit(cache=True, error_model="numpy")
+def blow(episodes: Records, near_wall: Floats, reach: float, speed_max: float, commands: Floats) -> None:
+    """Add the air's motion, uniform in a cube and growing as the gap to the mean wall closes, to commands.
+
+    Args:
+        episodes: (N,) records.
+        near_wall: (N,) amplitude at the wall (m/s).
+        reach: gap between body and wall from which on the air is still (m).
+        speed_max: fastest speed that the plant takes (m/s).
+        commands: (N, 8) block of `protocol.plant.CommandBatch`, in and out.
+    """
+    for i in range(commands.shape[0]):
+        if near_wall[i] <= 0.0:
+            continue
+        e = episodes[i]
+        gap = e.radius - e.radial_distance - e.body_radius
+        strength = near_wall[i] * min(max(1.0 - gap / reach, 0.0), 1.0)
+        if strength <= 0.0:
+            continue
+        command = commands[i]
+        norm = 0.0
+        for c in range(3):
+            air = strength * (2.0 * uniform(e.noise_seed, e.step, COMMAND + c) - 1.0)
+            command[c] = command[3] * command[c] + air
+            norm += command[c] ** 2
+        norm = math.sqrt(norm)
+        for c in range(3):
+            command[c] = command[c] / norm if norm > 1e-9 else e.frame[0, c]
+        command[3] = min(norm, speed_max)

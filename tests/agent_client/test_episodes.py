@@ -30,3 +30,21 @@ def test_records_hold_a_term_of_the_reward_for_each_name() -> None:
     assert dtype["reward_terms"].shape == (len(TERMS),)
     assert dtype["lidar"].shape == (72,)
     assert dtype.isalignedstruct
+
+
+def test_compiled_code_calls_none_of_other_files_unseen() -> None:
+    """But for perception, whose records carry the digest, no compiled function calls one of another file."""
+    folder = Path(str(agent_client.perception.__file__)).parent
+    compiled = {
+        node.name: path.name
+        for path in folder.glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef) and any("njit" in ast.unparse(d) for d in node.decorator_list)
+    }
+    for path in folder.glob("*.py"):
+        if path.name in (*_COMPILED, "perception.py"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef) and compiled.get(node.name) == path.name:
+                called = {n.id for n in ast.walk(node) if isinstance(n, ast.Name)} & set(compiled)
+                assert all(compiled[name] == path.name for name in called), (path.name, node.name)

@@ -320,3 +320,10 @@ def test_the_shipped_policy_flies_narrow_wide_and_long_tubes() -> None:
     score = score_of(pilots()["policy"], 2, 20, VARIED_TUBES)
     assert score.success >= 0.95
     assert score.timeout == 0.0
+
+
+def test_tuning_meets_other_draws_than_evaluation() -> None:
+    """Of the same seed no episode seed is shared, so that neither starts nor hidden parameters are known before."""
+    evaluated = {episode.seed for episode in draw_episodes(2, 200, 5, domain="evaluate")}
+    tuned = {episode.seed for episode in draw_episodes(2, 200, 5, domain="tune")}
+    assert not evaluated & tuned
