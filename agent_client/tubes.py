@@ -38,10 +38,18 @@ TUBE_SETTINGS: Final = (
     Condition("lengths", "R", "lengths of the axis, one of which is drawn", 1.0, 2000.0),
     Condition("radius", "m", "mean radius R; the whole tube is scaled by it", 0.5, 2.0),
     Condition("swing", "R", "greatest change of the radius along the tube, a gentle wave", 0.0, 0.3),
-    Condition("curvature_cap", "1/R", "greatest curvature; 0.9 is a bend radius of 1.1 R", 0.05, 0.9),
+    Condition(
+        "curvature_cap",
+        "1/R",
+        "greatest curvature of level 2 and of named shapes; 0.9 bends to 1.1 R",
+        0.05,
+        0.9,
+    ),
     Condition("ellipse", "R", "amplitude of an elliptic section", 0.0, 0.3),
     Condition("lobes", "R", "amplitude of a lobed section", 0.0, 0.2),
-    Condition("lobe_count", "lobes", "number of lobes of a lobed section", 3, 8, whole=True),
+    Condition(
+        "lobe_count", "lobes", "number of lobes of a lobed section; idle without lobes", 3, 8, whole=True
+    ),
 )
 """The settings of a recipe that are numbers, in the order of the fields of `TubeRecipe`, which has their
 defaults."""
@@ -136,13 +144,17 @@ def draw_tube(level: int, seed: Sequence[int], domain: Domain, recipe: TubeRecip
             level, seed, length, domain=domain, curvature_cap=cap, shape=shape, widest=widest
         )
 
-    easy = shape == CURRICULUM and level < LEVELS - 1
-    curve = draw_curve(CURVATURE_CAP if easy else recipe.curvature_cap)
+    curve = draw_curve(recipe.curvature_cap if changed_by_cap(shape, level) else CURVATURE_CAP)
     if curve.curvature.max(initial=0.0) * widest > WIDEST_FOLD:
         curve = draw_curve(WIDEST_FOLD / widest)
     phase = 2.0 * np.pi * (curve.step * np.arange(len(curve.points)) / wavelength + turn)
     radii = radius * (1.0 + swing * np.sin(phase))
     return sweep_section(Curve(curve.points * radius, curve.step * radius), radii, harmonics)
+
+
+def changed_by_cap(shape: str, level: int) -> bool:
+    """Whether a recipe's `curvature_cap` bounds the tubes of a level: the curriculum's easy ones keep the paper's."""
+    return shape != CURRICULUM or level == LEVELS - 1
 
 
 def _draw_section(rng: np.random.Generator, recipe: TubeRecipe) -> Floats:

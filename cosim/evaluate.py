@@ -30,9 +30,8 @@ def evaluate(options: EvaluateOptions, *, as_json: bool) -> None:
     plan = make_plan(options)
     if options.grid is not None:
         require_matplotlib()
-    for pilot in plan.pilots.values():
-        for note in pilot.notes:
-            click.echo(note, err=True)
+    for note in (*plan.notes, *(note for pilot in plan.pilots.values() for note in pilot.notes)):
+        click.echo(note, err=True)
     with results_folder(options.out), crew(options.workers) as run:
         entries = list(_fly(run, options, plan))
     report = report_of(options, plan, entries)

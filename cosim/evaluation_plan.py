@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +15,14 @@ from agent_client.settings import Settings
 from agent_client.tubes import TubeRecipe
 from agent_client.tuning import TUNING_EPISODES
 from cosim.errors import CosimError
-from cosim.named_settings import NamedSettings, option_name, parse_setting, setting_names, take_settings
+from cosim.named_settings import (
+    NamedSettings,
+    idle_settings,
+    option_name,
+    parse_setting,
+    setting_names,
+    take_settings,
+)
 from cosim.options import SHIPPED_POLICY
 from cosim.pilots import (
     ANY_DRONE,
@@ -118,6 +125,8 @@ class Plan:
     variants: tuple[Variant, ...]
     left_out: Mapping[str, tuple[float, float]]
     """Ranges of the hard conditions that have no meaning without inertia."""
+    notes: tuple[str, ...] = ()
+    """What the user should know before it is flown."""
 
     @property
     def dynamics(self) -> str:
@@ -152,7 +161,21 @@ def make_plan(options: EvaluateOptions) -> Plan:
         variants = _map_variants(options, options.grid, conditions, recipe)
     elif options.sweep is not None:
         variants = _sweep_variants(options, options.sweep, engine, conditions, recipe)
-    return Plan(engine, _pilots(options, conditions), tuple(variants), left_out)
+    notes = (*_repeats(options.sweep, variants), *_idle(options, variants))
+    return Plan(engine, _pilots(options, conditions), tuple(variants), left_out, notes)
+
+
+def _repeats(sweep: str | None, variants: Sequence[Variant]) -> Iterator[str]:
+    """Whether a sweep names a value twice, which is flown once."""
+    if sweep is not None and len(variants) < len(sweep.split(",")):
+        yield f"--sweep {sweep}: values that are named twice are flown once"
+
+
+def _idle(options: EvaluateOptions, variants: Sequence[Variant]) -> list[str]:
+    """Settings that the user named and that change nothing in any variant."""
+    names = {*options.settings.conditions, *options.settings.tubes, *variants[0].values}
+    idle = [dict(idle_settings(names, v.conditions, v.recipe, options.levels)) for v in variants]
+    return [f"{option_name(n)}: {why}" for n, why in idle[0].items() if all(n in other for other in idle)]
 
 
 def _engine(options: EvaluateOptions) -> Engine:
@@ -199,7 +222,7 @@ def _sweep_variants(
     if name in (*options.settings.conditions, *options.settings.tubes):
         raise CosimError(f"--sweep {name}: {option_name(name)} gives it too; drop one of them")
     try:
-        values = [parse_setting(name, value.strip()) for value in text.split(",")]
+        values = list(dict.fromkeys(parse_setting(name, value.strip()) for value in text.split(",")))
     except click.BadParameter as error:
         raise CosimError(f"--sweep {name}: {error.message}") from error
     if name in conditions.ranges():

@@ -59,8 +59,9 @@ def _heading(report: Row) -> Iterator[str]:
         yield f"settings: {' '.join(report['settings'])}"
     if report["hard"]:
         ranges = [f"{name} {_text(span)}" for name, span in report["changed"].items()]
-        bends = f"bends up to {report['recipe']['curvature_cap']:g} / R at level 2"
-        yield f"hard conditions: {', '.join(ranges)}; {bends}"
+        if "curvature_cap" in report["recipe"]:  # not swept
+            ranges.append(f"bends up to {report['recipe']['curvature_cap']:g} / R at level 2")
+        yield f"hard conditions: {', '.join(ranges)}"
     if report["left_out"]:
         left_out = [f"{option_name(name)[2:]} {_text(span)}" for name, span in report["left_out"].items()]
         yield f"left out, since they mean nothing without inertia: {', '.join(left_out)}"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -72,15 +72,40 @@ def parse_setting(name: str, text: str) -> Any:
         KeyError: no such setting.
     """
     for option in settings_options():
-        if option.name == name and isinstance(option.type, SettingType):
+        if option.name == name:
             return option.type.convert(text, option, None)
     raise KeyError(name)
 
 
 def setting_names() -> list[str]:
-    """Names of all settings that have a number for a value, or `shape`."""
+    """Names of all settings."""
     conditions, tubes = _tables()
     return [row.name for row in (*conditions, *tubes)] + ["shape"]
+
+
+def idle_settings(
+    names: Collection[str], conditions: Conditions, recipe: TubeRecipe, levels: Collection[int]
+) -> Iterator[tuple[str, str]]:
+    """Those of the named settings that change nothing under the others, each with the reason.
+
+    Args:
+        names: of the settings that the user chose.
+        conditions: that are flown under.
+        recipe: of the tubes that are flown through.
+        levels: of these tubes.
+    """
+    from agent_client.tubes import changed_by_cap
+
+    if "mass" in names and max(conditions.drag[1], conditions.gust[1]) == 0.0:
+        yield "mass", "the law scales the force with the mass; without --drag or --gust it changes nothing"
+    if "lobe_count" in names and recipe.lobes[1] == 0.0:
+        yield "lobe_count", "without lobes it changes nothing; add --lobes"
+    kept = [str(level) for level in sorted(levels) if not changed_by_cap(recipe.shape, level)]
+    if "curvature_cap" in names and kept:
+        yield (
+            "curvature_cap",
+            f"at level {' and '.join(kept)} it changes nothing: these are the paper's own curves",
+        )
 
 
 def write_value(value: Any) -> str:

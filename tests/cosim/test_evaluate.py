@@ -18,7 +18,8 @@ from flights import DEADLINE, command, environment, leftovers, run_cosim, run_he
 from agent_client.conditions import CONDITIONS, HARD, Conditions
 from agent_client.evaluation import wilson
 from agent_client.tubes import HARD_TUBES, PAPER_TUBES, TUBE_SETTINGS, TubeRecipe
-from cosim.named_settings import arguments_of, parse_setting
+from cosim.evaluation_plan import EvaluateOptions, make_plan
+from cosim.named_settings import NamedSettings, arguments_of, parse_setting, setting_names, write_value
 
 KEYS = {
     "policy", "dynamics", "level", "episodes", "success", "exit", "collision", "timeout", "quality",
@@ -226,7 +227,7 @@ def test_settings_are_written_as_their_options_take_them() -> None:
         given = {
             option[2:].replace("-", "_"): text for option, text in zip(words[::2], words[1::2], strict=True)
         }
-        found = {name: parse_setting(name, text) for name, text in given.items() if name != "shape"}
+        found = {name: parse_setting(name, text) for name, text in given.items()}
         ranges = {row.name: found.pop(row.name) for row in CONDITIONS if row.name in found}
         base, tubes = (HARD, HARD_TUBES) if hard else (Conditions(), PAPER_TUBES)
         assert base.with_ranges(ranges) == conditions
@@ -235,6 +236,50 @@ def test_settings_are_written_as_their_options_take_them() -> None:
         assert all(getattr(recipe, name) == getattr(tubes, name) for name in same)
         assert given.get("shape", tubes.shape) == recipe.shape
     assert arguments_of(HARD, HARD_TUBES) == ["--hard"]
+
+
+def test_every_setting_can_be_swept() -> None:
+    """A sweep of any named setting, `shape` too, is one variant a value; a value named twice is flown once."""
+    values = {
+        "shape": ["helix", "elbow"],
+        "lobe_count": [(3.0, 3.0), (5.0, 5.0)],
+        "lengths": [(10.0,), (20.0,)],
+    }
+    for name in setting_names():
+        row = next((row for row in (*CONDITIONS, *TUBE_SETTINGS) if row.name == name), None)
+        ends = [] if row is None else [(row.lowest, row.lowest), (row.highest, row.highest)]
+        if name == "curvature_cap":
+            ends = [low for low, _ in ends]
+        swept = values.get(name, ends)
+        text = ",".join(write_value(value) for value in swept)
+        plan = make_plan(
+            EvaluateOptions(("lidar-rule",), dynamics="rigid-body", sweep=f"{name}={text},{text}")
+        )
+        assert [variant.values[name] for variant in plan.variants] == swept
+        assert "flown once" in plan.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("settings", "sweep", "levels", "words"),
+    [
+        (NamedSettings(False, {"mass": (2.0, 2.0)}), None, (2,), "--mass: the law scales the force"),
+        (NamedSettings(), "mass=1,2", (2,), "--mass: the law scales the force"),
+        (NamedSettings(False, {"mass": (2.0, 2.0)}), "gust=0,1", (2,), None),
+        (NamedSettings(), "lobe_count=3,5", (2,), "--lobe-count: without lobes"),
+        (NamedSettings(False, {}, {"lobes": (0.1, 0.1)}), "lobe_count=3,5", (2,), None),
+        (NamedSettings(), "curvature_cap=0.3,0.9", (0, 1, 2), "--curvature-cap: at level 0 and 1"),
+        (NamedSettings(), "curvature_cap=0.3,0.9", (2,), None),
+        (NamedSettings(False, {}, {"shape": "elbow"}), "curvature_cap=0.3,0.9", (0,), None),
+    ],
+)
+def test_a_setting_that_changes_nothing_is_named(
+    settings: NamedSettings, sweep: str | None, levels: tuple[int, ...], words: str | None
+) -> None:
+    """A note says of a setting, given or swept, that it changes nothing under the others; else there is none."""
+    options = EvaluateOptions(("lidar-rule",), levels, dynamics="rigid-body", settings=settings, sweep=sweep)
+    notes = make_plan(options).notes
+    assert len(notes) == (words is not None)
+    assert all(note.startswith(str(words)) for note in notes)
 
 
 def test_every_setting_is_an_option_that_help_names(tmp_path: Path) -> None:
