@@ -106,7 +106,11 @@ def ablate(options: AblateOptions, *, as_json: bool) -> None:
             logs = _train(run, plan, folder)
             scores = _fly(run, plan, folder, options)
     except (KeyboardInterrupt, Terminated):
-        kept = "nothing was kept" if options.out is None else f"what was trained is in {options.out}"
+        out = options.out
+        trained = out is not None and any(
+            _checkpoint(out, variant, seed).exists() for variant in plan.variants for seed in plan.seeds
+        )
+        kept = f"what was trained is in {out}" if trained else "nothing was kept"
         click.echo(f"stopped before the end: no table; {kept}", err=True)
         raise
     rows = [

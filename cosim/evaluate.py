@@ -9,6 +9,7 @@ from typing import Final
 import click
 
 from agent_client.evaluation import draw_episodes
+from cosim.errors import Terminated
 from cosim.evaluation_plan import EvaluateOptions, Plan, make_plan
 from cosim.evaluation_report import Entry, episodes_of, report_of
 from cosim.evaluation_table import map_lines, table_lines
@@ -32,8 +33,12 @@ def evaluate(options: EvaluateOptions, *, as_json: bool) -> None:
         require_matplotlib()
     for note in (*plan.notes, *(note for pilot in plan.pilots.values() for note in pilot.notes)):
         click.echo(note, err=True)
-    with results_folder(options.out), crew(options.workers) as run:
-        entries = list(_fly(run, options, plan))
+    try:
+        with results_folder(options.out), crew(options.workers) as run:
+            entries = list(_fly(run, options, plan))
+    except (KeyboardInterrupt, Terminated):
+        click.echo("stopped before the end: no table; nothing was kept", err=True)
+        raise
     report = report_of(options, plan, entries)
     if options.out is not None:
         write_results(options.out, report | {"flown": episodes_of(plan, entries)})
@@ -45,7 +50,12 @@ def evaluate(options: EvaluateOptions, *, as_json: bool) -> None:
         for line in table_lines(report) if options.grid is None else map_lines(report):
             click.echo(line)
     if options.out is not None:
-        click.echo(f"every episode, and how to fly it in PyBullet: {options.out / RESULTS}", err=True)
+        again = (
+            "which repeats it" if plan.engine == "bullet" else f"which is another world than {plan.engine!r}"
+        )
+        click.echo(
+            f"every episode, and how to fly it in PyBullet, {again}: {options.out / RESULTS}", err=True
+        )
 
 
 def _fly(run: RunJobs, options: EvaluateOptions, plan: Plan) -> Iterator[Entry]:

@@ -114,7 +114,10 @@ def _paper_rows(levels: Sequence[int]) -> list[dict[str, Any]]:
 
 
 def episodes_of(plan: Plan, entries: Sequence[Entry]) -> list[dict[str, Any]]:
-    """Every episode with what it drew, and the command that flies it again under PyBullet."""
+    """Every episode with what it drew, and the command that flies its tube, start and draws under PyBullet.
+
+    The command repeats the episode bit for bit (`launch_repeats`) where PyBullet flew it in the first place.
+    """
     rows = []
     for entry in entries:
         variant = entry.variant
@@ -132,13 +135,14 @@ def episodes_of(plan: Plan, entries: Sequence[Entry]) -> list[dict[str, Any]]:
                     **{name: _plain(value) for name, value in variant.values.items()},
                     **row,
                     "launch": _launch(entry.choice, result, settings),
+                    "launch_repeats": plan.engine == "bullet",
                 }
             )
     return rows
 
 
 def _launch(choice: PilotChoice, result: EpisodeResult, settings: Sequence[str]) -> str:
-    """The `cosim launch` that flies an episode again."""
+    """The `cosim launch` of an episode's tube, start and draws."""
     policy = PURE_PURSUIT if choice.name == TUNED_PURSUIT else choice.name
     words = ["cosim", "launch", "--tube", f"level={result.level},seed={result.seed}", "--policy", policy]
     for option, value in (("--lookahead", choice.lookahead), ("--speed", choice.speed)):

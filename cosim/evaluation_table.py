@@ -33,7 +33,7 @@ def table_lines(report: Row) -> Iterator[str]:
         flown = list(group)
         setting = flown[0].get("setting")
         title = f"level {level}" if setting is None else f"{setting} {_text(value)}, level {level}"
-        width = max(len(row["policy"]) for row in [*flown, *report["paper"]]) + 9
+        width = max(len(title) + 1, *(len(row["policy"]) + 9 for row in [*flown, *report["paper"]]))
         yield ""
         yield f"{title:{width}}" + "".join(f"{name:>{size}}" for name, size in COLUMNS)
         for row in report["paper"]:
@@ -101,7 +101,8 @@ def _legend(report: Row) -> Iterator[str]:
     """What was flown, and what each pilot knew."""
     yield (
         "success, exit, collision, time-out in %; 95 %: Wilson's interval of the success; Q: centring and alignment; "
-        "length: steps over the fewest possible, of the successes; the paper counts every failure as an exit"
+        "length: steps over length / (v_max dt), of the successes, below 1 where corners are cut; the paper counts "
+        "every failure as an exit"
     )
     rows = report["rows"]
     for name in dict.fromkeys(row["policy"] for row in rows):

@@ -25,6 +25,9 @@ TUNED_PURSUIT: Final = "pure-pursuit-tuned"
 LIDAR_RULE: Final = "lidar-rule"
 OF_CENTRELINE: Final = ("progress", "position_f", "position_u", "position_r")
 """Features that are known from the centreline alone."""
+PURSUIT_SEES: Final = (
+    "exact centreline and position; no sensor noise, drop-out or delay of observations touches it"
+)
 SHIPPED_CHECKPOINT: Final = Path(agent_client.__file__).parent / "policies" / "tube_ppo.zip"
 
 
@@ -137,7 +140,7 @@ def read_pilot(choice: PilotChoice, terms: Terms | None = None) -> Pilot:
         lambda geometry: PurePursuit(geometry, base, lookahead=lookahead, speed=speed),
         base,
         dt,
-        {"name": choice.name, "lookahead": lookahead, "speed": speed, "sees": "exact centreline"},
+        {"name": choice.name, "lookahead": lookahead, "speed": speed, "sees": PURSUIT_SEES},
         (),
     )
 
@@ -176,9 +179,15 @@ def _read_checkpoint(name: str, path: Path, base: Settings, terms: Terms) -> Pil
 
 
 def _sees(contract: Contract) -> str:
-    """How much a policy sees, and whether the centreline, which no drone in an unknown tube does, is part of it."""
+    """How much a policy sees, and whether the centreline, which no drone in an unknown tube does, is part of it.
+
+    A policy that learnt from a teacher has seen more in training than in flight, which is said too.
+    """
     text = f"{len(contract.observations) - len(contract.masked)} features"
     if len(contract.lags) > 1:
         text += f" at {len(contract.lags)} times"
     known = [name for name in OF_CENTRELINE if name not in contract.masked]
-    return f"{text}, of the centreline {', '.join(known)}" if known else f"{text}, no centreline"
+    text += f", of the centreline {', '.join(known)}" if known else ", no centreline"
+    if contract.training.get("imitation"):
+        text += "; learnt by imitating a teacher that sees the axis and the dynamics"
+    return text

@@ -300,7 +300,7 @@ def test_ctrl_c_keeps_what_is_trained_and_leaves_nothing_else(tmp_path: Path, wo
         process.kill()
         process.communicate()
     assert (process.returncode, stdout) == (130, "")
-    assert "stopped before the end" in stderr
+    assert f"stopped before the end: no table; what was trained is in {out}" in stderr
     assert "Traceback" not in stderr
     assert not (out / "results.json").exists()
     assert load_policy(out / "full" / "seed0.zip").contract.training["steps"] == 400

@@ -19,6 +19,7 @@ from agent_client.conditions import CONDITIONS, HARD, Conditions
 from agent_client.evaluation import wilson
 from agent_client.tubes import HARD_TUBES, PAPER_TUBES, TUBE_SETTINGS, TubeRecipe
 from cosim.evaluation_plan import EvaluateOptions, make_plan
+from cosim.evaluation_table import table_lines
 from cosim.named_settings import NamedSettings, arguments_of, parse_setting, setting_names, write_value
 
 KEYS = {
@@ -52,8 +53,11 @@ def test_everybody_is_flown_when_nobody_is_named(kinematic: tuple[dict[str, Any]
         assert row["success"] + row["exit"] + row["collision"] + row["timeout"] == pytest.approx(1.0)
         assert tuple(row["success_ci95"]) == wilson(round(6 * row["success"]), 6)
     assert rows[0]["lookahead"] == 3.0
-    assert rows[1]["sees"] == "exact centreline"
+    assert rows[1]["sees"].startswith("exact centreline and position; no sensor noise")
     assert "no centreline" in rows[2]["sees"]
+    assert rows[3]["sees"].endswith(
+        "no centreline; learnt by imitating a teacher that sees the axis and the dynamics"
+    )
 
 
 def test_the_papers_figures_stand_beside(kinematic: tuple[dict[str, Any], dict[str, Any]]) -> None:
@@ -84,6 +88,7 @@ def test_every_episode_is_kept(kinematic: tuple[dict[str, Any], dict[str, Any]])
         f"cosim launch --tube level=0,seed={tuned['seed']} --policy pure-pursuit "
         f"--lookahead {found['lookahead']:g} --speed {found['speed']:g}"
     )
+    assert not any(e["launch_repeats"] for e in flown)
 
 
 @pytest.mark.parametrize("engine", ["reference", "bullet"])
@@ -150,6 +155,11 @@ def test_a_sweep_evaluates_each_value_alone() -> None:
     assert [(row["setting"], row["value"]) for row in rows] == [("lengths", 10.0), ("lengths", 30.0)]
     assert 2.0 * rows[0]["mean_steps"] < rows[1]["mean_steps"]
     assert "lengths" not in report["recipe"]
+    named = [{**row, "setting": "a setting with a name that is longer than any policy's"} for row in rows]
+    lines = list(table_lines({**report, "rows": named}))
+    tops = [at for at, line in enumerate(lines) if line.endswith("length")]
+    assert len(tops) == 2
+    assert all(len(lines[at]) == len(lines[at + 1]) == len(lines[at + 3]) for at in tops)
 
 
 def test_a_map_shows_where_nobody_succeeds(tmp_path: Path) -> None:
@@ -362,6 +372,7 @@ def test_ctrl_c_ends_workers_and_servers(tmp_path: Path, workers: str) -> None:
         os.killpg(process.pid, signal.SIGINT)
         _, stderr = process.communicate(timeout=DEADLINE)
         assert process.returncode == 130
+        assert "stopped before the end: no table; nothing was kept" in stderr
         assert "Traceback" not in stderr
         wait_until(lambda: gone([*started, *servers]))
         for pid in (process.pid, *started):

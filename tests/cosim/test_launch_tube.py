@@ -43,6 +43,7 @@ def test_an_evaluated_episode_is_flown_again_bit_for_bit(
     flown = json.loads((tmp_path / "evaluation" / "results.json").read_text())["flown"]
     for index in (1, 5):  # of the policy and of Pure Pursuit
         episode = flown[index]
+        assert episode["launch_repeats"]
         words = shlex.split(episode["launch"])
         assert words[:2] == ["cosim", "launch"]
         report = fly(*words[2:], out=f"again{index}").report
