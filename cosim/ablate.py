@@ -23,14 +23,11 @@ from agent_client.tubes import HARD_TUBES, LEVELS, PAPER_TUBES, TubeRecipe
 from cosim.ablation_table import table_lines
 from cosim.errors import CosimError, Terminated
 from cosim.evaluation_plan import INERTIA_ALONE
-from cosim.evaluation_report import PAPER
+from cosim.evaluation_report import PAPER_SUCCESS
 from cosim.folders import RESULTS, results_folder, write_results
 from cosim.pilots import PilotChoice
 from cosim.versions import versions
 from cosim.workers import LANES, Engine, FlyJob, RunJobs, TrainJob, crew, do_jobs
-
-PAPER_SUCCESS: Final = tuple(success for success, _, _ in dict(PAPER)["PPO"])
-"""Success rates of the paper's policy by level."""
 
 
 @dataclass(frozen=True)

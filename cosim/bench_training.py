@@ -26,12 +26,10 @@ from agent_client.settings import Settings
 from agent_client.tubes import LEVELS, POOL_SIZE, draw_pool
 from agent_client.world import TubeWorld
 from cosim.errors import CosimError
+from cosim.evaluation_report import PAPER_SUCCESS
 from cosim.train import CHECKPOINT, load_training
 from protocol.agent import SessionSettings
 from protocol.twin import open_twin
-
-PAPER_SUCCESS: Final = (0.84, 0.71, 0.87)
-"""Success rates of the paper's PPO by level (paper, Table of the comparison with Pure Pursuit)."""
 
 SEED: Final = 20_000
 """Of the tubes that the trained policy is judged on."""

@@ -48,8 +48,8 @@ INERTIA_ALONE: Final = tuple(row.name for row in CONDITIONS if row.needs_inertia
 class MapGrid:
     """The cells of a map: every gain (1/s) with every compensation (weight)."""
 
-    gains: tuple[float, ...]
-    compensations: tuple[float, ...]
+    gains: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+    compensations: tuple[float, ...] = (0.7, 0.8, 0.9, 1.0, 1.1)
 
 
 @dataclass(frozen=True)
@@ -75,11 +75,13 @@ def read_options(arguments: dict[str, Any]) -> EvaluateOptions:
     """The options from a command's keyword arguments (`cosim.options.evaluate_options`).
 
     Raises:
-        CosimError: a map without a folder to draw it into, or in a world without inertia.
+        CosimError: a map without a folder to draw it into, or in a world without inertia; cells without a map.
     """
     settings = take_settings(arguments)
     wants_map = arguments.pop("draw_map")
-    grid = MapGrid(arguments.pop("map_gains"), arguments.pop("map_compensations"))
+    cells = {name: arguments.pop(f"map_{name}") for name in ("gains", "compensations")}
+    cells = {name: values for name, values in cells.items() if values is not None}
+    grid = MapGrid(**cells) if wants_map else None
     usual: dict[str, Any] = {
         "levels": (0, 1, 2),
         "episodes": 100,
@@ -99,11 +101,13 @@ def read_options(arguments: dict[str, Any]) -> EvaluateOptions:
             "engine": "reference",
             "tuning_episodes": 40,
         }
+    elif cells:
+        raise CosimError(f"{option_name(f'map_{min(cells)}')}: only --map has one; add --map --out DIR")
     usual["workers"] = len(os.sched_getaffinity(0))
     given: dict[str, Any] = {
         name: usual.get(name) if value is None else value for name, value in arguments.items()
     }
-    return EvaluateOptions(settings=settings, grid=grid if wants_map else None, **given)
+    return EvaluateOptions(settings=settings, grid=grid, **given)
 
 
 @dataclass(frozen=True)

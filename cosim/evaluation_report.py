@@ -21,6 +21,9 @@ PAPER: Final = (
 """Success, exits and quality at the levels 0, 1, 2, 100 episodes each: the paper's table of its section "Comparison
 with the Reference Algorithm". It tells neither collisions from exits nor time-outs."""
 
+PAPER_SUCCESS: Final = tuple(success for success, _, _ in dict(PAPER)["PPO"])
+"""Success rates of the paper's policy by level."""
+
 PAPER_EPISODES: Final = 100
 
 

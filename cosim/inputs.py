@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -12,7 +12,7 @@ from typing import Any, Final, Literal
 from agent_client.conditions import NAMES, PARAMETERS_OF, Conditions, Records, draw_conditions
 from agent_client.tubes import TubeRecipe, draw_tube
 from cosim.errors import CosimError, OutputError
-from cosim.named_settings import option_name
+from cosim.named_settings import idle_settings, option_name
 from cosim.options import SHIPPED_MESH, FlightOptions
 from cosim.pilots import existing_file
 from meshes.geometry import Geometry
@@ -100,6 +100,19 @@ def check_options(options: FlightOptions) -> None:
                 raise CosimError(f"{option_name(name)}: --tube is a generated tube; drop one of them")
         if options.tube.length is not None and "lengths" in options.settings.tubes:
             raise CosimError("--lengths: --tube has a length= already; drop one of them")
+
+
+def setting_notes(options: FlightOptions, conditions: Conditions, recipe: TubeRecipe) -> Iterator[str]:
+    """What the user named and what changes nothing of this flight."""
+    settings = options.settings
+    if options.tube is None and settings.hard:
+        yield "--hard: on a mesh the hard conditions alone; its bends are those of generated tubes (--tube)"
+    names = {*settings.conditions, *settings.tubes}
+    if options.parameters:  # a named disturbance or drag gives the mass its meaning
+        names.discard("mass")
+    levels = () if options.tube is None else (options.tube.level,)
+    for name, why in idle_settings(names, conditions, recipe, levels):
+        yield f"{option_name(name)}: {why}"
 
 
 def find_mesh(options: FlightOptions) -> Path | None:

@@ -33,6 +33,7 @@ from cosim.inputs import (
     generate_conduit,
     parse_parameters,
     read_conduit,
+    setting_notes,
 )
 from cosim.live import LiveLine
 from cosim.options import SHIPPED_MESH, SHIPPED_POLICY, FlightOptions
@@ -83,7 +84,7 @@ def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
     ranges, recipe = options.settings.resolve()
     conditions = draw_flight_conditions(options, ranges, parse_parameters(options.parameters))
     mesh, choice = find_mesh(options), choose_pilot(options.policy, options.lookahead, options.speed)
-    for note in _chosen_for_the_user(mesh, choice):
+    for note in (*_chosen_for_the_user(mesh, choice), *setting_notes(options, ranges, recipe)):
         say(note)
     with ExitStack() as stack:
         folder = stack.enter_context(new_folder(options.out, _label(options, mesh, choice)))

@@ -129,7 +129,7 @@ _FLIGHT: Final = (
     click.option("--policy", metavar="PATH|pure-pursuit|lidar-rule", default=SHIPPED_POLICY, show_default=True,
                  help="Checkpoint, or a baseline; Pure Pursuit knows the centreline."),
     click.option("--lookahead", type=float, callback=_positive, metavar="M",
-                 help="Of Pure Pursuit (m) [default: 1]."),
+                 help="Of Pure Pursuit (m) [default: 1; `cosim evaluate` takes the camera's 3]."),
     click.option("--speed", type=float, callback=_positive, metavar="V",
                  help="Of Pure Pursuit (m/s) [default: 2]."),
     click.option("--dt", type=Fraction(), help="Control step (s) [default: the checkpoint's]."),
@@ -181,8 +181,8 @@ def _levels(ctx: click.Context, param: click.Parameter, value: str | None) -> tu
 
 _EVALUATE: Final = (
     click.option("--policy", "policies", multiple=True, metavar="P",
-                 help="Checkpoint, pure-pursuit, pure-pursuit-tuned or lidar-rule; repeatable "
-                      "[default: all three and tube_ppo]."),
+                 help="Checkpoint, pure-pursuit (look-ahead the camera's 3 m; in `cosim launch` 1 m), "
+                      "pure-pursuit-tuned or lidar-rule; repeatable [default: all three and tube_ppo]."),
     click.option("--levels", callback=_levels, metavar="L,L,...",
                  help="Levels of the curriculum [default: 0,1,2; 2 for a map]."),
     click.option("--episodes", type=click.IntRange(1, 1_000_000), metavar="N",
@@ -199,10 +199,10 @@ _EVALUATE: Final = (
     click.option("--map", "draw_map", is_flag=True,
                  help="Draw success over gain and compensation in place of the table [--dynamics rigid-body, "
                       "--engine reference]."),
-    click.option("--map-gains", callback=_numbers, metavar="G,G,...", default="1,1.5,2,3,4,6,8",
-                 show_default=True, help="Columns of the map (1/s)."),
-    click.option("--map-compensations", callback=_numbers, metavar="C,C,...", default="0.7,0.8,0.9,1,1.1",
-                 show_default=True, help="Rows of the map (weight)."),
+    click.option("--map-gains", callback=_numbers, metavar="G,G,...",
+                 help="Columns of the map (1/s) [default: 1,1.5,2,3,4,6,8]."),
+    click.option("--map-compensations", callback=_numbers, metavar="C,C,...",
+                 help="Rows of the map (weight) [default: 0.7,0.8,0.9,1,1.1]."),
     click.option("--workers", type=click.IntRange(1, 512), metavar="N",
                  help="Processes that fly; results do not depend on it [default: the cores]."),
     click.option("--out", type=click.Path(path_type=Path), metavar="DIR",

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import textwrap
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from cosim.errors import CosimError, OutputError
+from cosim.pilots import TUNED_PURSUIT
+
+TITLE_SIZE: Final = 10
+"""Of the figure's title (points)."""
+CHARACTERS_PER_INCH: Final = 12
+"""Of a title of this size, so that none is cut off at the sides."""
 
 
 def require_matplotlib() -> None:
@@ -50,18 +57,20 @@ def draw_map(path: Path, report: dict[str, Any]) -> None:
             panel.text(x, y, f"{value:.0f}", ha="center", va="center", color=shade, fontsize=9)
         panel.set_xticks(range(len(gains)), [f"{gain:g}" for gain in gains])
         panel.set_yticks(range(len(compensations)), [f"{c:g}" for c in compensations])
-        panel.set_title(f"{names[j]}, level {levels[i]}", fontsize=10)
+        name = "tuned Pure Pursuit" if names[j] == TUNED_PURSUIT else names[j]
+        panel.set_title(f"{name}, level {levels[i]}", fontsize=10)
         if i == len(levels) - 1:
             panel.set_xlabel("gain k_v (1/s)")
         if j == 0:
             panel.set_ylabel("gravity compensation c (weight)")
     figure.colorbar(image, ax=panels, label="success (%)", shrink=0.9)
     hard = ", hard conditions otherwise" if report["hard"] else ""
-    figure.suptitle(
+    title = (
         f"Success of {report['episodes']} flights a cell, engine {report['engine']}, seed {report['seed']}{hard}; "
-        "Pure Pursuit tuned anew for every cell",
-        fontsize=10,
+        "Pure Pursuit tuned anew for every cell"
     )
+    line = int(figure.get_figwidth() * CHARACTERS_PER_INCH)
+    figure.suptitle(textwrap.fill(title, line), fontsize=TITLE_SIZE)
     try:
         figure.savefig(path, dpi=120)
     except OSError as error:

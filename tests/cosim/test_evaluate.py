@@ -193,6 +193,8 @@ def test_a_map_shows_where_nobody_succeeds(tmp_path: Path) -> None:
         (("--levels", "0,3"), ("0,1,2", "0,3")),
         (("--engine", "bullet"), ("--engine", "rigid-body")),
         (("--map",), ("--out",)),
+        (("--map-gains", "1,2"), ("--map-gains", "add --map")),
+        (("--map-compensations", "1"), ("--map-compensations", "add --map")),
         (("--map", "--dynamics", "kinematic", "--out", "x"), ("--dynamics",)),
         (("--map", "--gain", "2", "--out", "x"), ("--map-gains",)),
         (("--map", "--sweep", "radius=1", "--out", "x"), ("--sweep",)),
