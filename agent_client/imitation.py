@@ -1,14 +1,15 @@
-"""Learning from a teacher before PPO: the policy flies, the teacher says what it would have done (DAgger).
+"""Learning from a teacher in place of PPO: the policy flies, the teacher says what it would have done (DAgger).
 
 Source: Ross, Gordon, Bagnell, "A reduction of imitation learning and structured prediction to no-regret online
 learning" (2011). Our addition; the paper's policy learns from its reward alone, and so do the presets `paper` and
 `quick`. The teacher sees the exact axis and the hidden dynamics, the policy only its sensors' history.
+PPO going on from an imitated policy was tried and ended lower (`agent_client.presets`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -21,6 +22,9 @@ from agent_client.training_options import Hyperparameters, Imitation
 from agent_client.world import TubeWorld
 
 Singles = NDArray[np.float32]
+
+REFILL: Final = 10
+"""Rounds at most that a resumed imitation flies to fill its memory before it learns on."""
 
 
 class Memory:
@@ -55,10 +59,10 @@ class Imitator:
     """Rounds of flying with the policy and learning from the teacher.
 
     Args:
-        world: the lanes to fly in.
+        world: the lanes to fly in, before its first episode.
         env: whose normalisation the policy's observations go through; its statistics are set here.
         policy: stable-baselines3's actor-critic policy; its actor learns, its critic is left alone.
-        hyper: PPO's numbers; a round is one of its batches.
+        hyper: `IMITATED` of them are taken.
         options: how to imitate.
         rounds: how many there will be.
         seed: of the draws from the memory and of the takeover.
@@ -83,23 +87,41 @@ class Imitator:
         self._velocities = torch.from_numpy(self._teacher.velocities.astype(np.float32))
         self._memory = Memory(min(options.memory, rounds * hyper.batch), self._seen)
         self._rng = np.random.default_rng(seed)
-        self._observation = world.restart()
+        self._observation: Singles
 
-    def round(self, number: int, on_episode: Callable[[dict[str, Any]], None]) -> None:
+    def begin(self, done: int = 0) -> None:
+        """Begin episodes in all lanes, and after `done` rounds fill the memory, which is too large to be kept.
+
+        The last of those rounds, up to `REFILL`, are flown once more, by the policy as it is and with new draws;
+        nothing is learnt from them, and their episodes and steps count for nothing.
+        """
+        self._observation = self._world.restart()
+        curriculum = self._world.curriculum
+        level, results, passed = curriculum.level, curriculum.results, curriculum.passed
+        for number in range(max(0, done - REFILL), done):
+            self._fly(self._share(number), False, lambda _: None)
+        curriculum.restore(level, results, passed)
+
+    def _share(self, number: int) -> float:
+        """Share of the lanes that the teacher flies in a round."""
+        return max(0.0, 1.0 - number / self._options.takeover)
+
+    def round(self, number: int, on_episode: Callable[[dict[str, Any]], None]) -> float:
         """Fly one batch, the teacher in a share of the lanes that falls to none, and learn from the memory.
 
         Args:
             number: of the round, from 0.
             on_episode: told of every episode that ended (`agent_client.environment.episode_info`).
+
+        Returns:
+            The mean loss of its updates.
         """
-        share = max(0.0, 1.0 - number / self._options.takeover)
-        self._fly(share, number < self._options.normalised_rounds, on_episode)
+        self._fly(self._share(number), number < self._options.normalised_rounds, on_episode)
         spent = number / self._rounds
         first, last = self._options.learning_rate, self._options.final_learning_rate
         for group in self.optimiser.param_groups:
             group["lr"] = first + (last - first) * spent
-        for _ in range(self._options.updates):
-            self._learn()
+        return float(np.mean([self._learn() for _ in range(self._options.updates)]))
 
     def _fly(self, share: float, normalising: bool, on_episode: Callable[[dict[str, Any]], None]) -> None:
         world, lanes = self._world, self._world.session.lanes
@@ -126,8 +148,8 @@ class Imitator:
         chosen: NDArray[np.int64] = logits.argmax(dim=1).numpy()
         return chosen
 
-    def _learn(self) -> None:
-        """One step down the cross-entropy between the policy and the teacher's merit of the actions."""
+    def _learn(self) -> float:
+        """One step down the cross-entropy between the policy and the teacher's merit of the actions; the loss."""
         observations, commands = self._memory.draw(self._rng, self._options.minibatch)
         velocities = self._velocities
         # The squared distance between command and velocity, but for what is the same for all actions.
@@ -138,6 +160,7 @@ class Imitator:
         self.optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimiser.step()
+        return float(loss.detach())
 
     def _normalised(self, observations: Singles) -> torch.Tensor:
         seen, clip = self._env.obs_rms, self._hyper.observation_clip

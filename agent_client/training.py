@@ -1,4 +1,4 @@
-"""Training by proximal policy optimisation, with stable-baselines3 and the paper's hyperparameters.
+"""Training by proximal policy optimisation, with stable-baselines3 and the paper's hyperparameters, or by imitation.
 
 The paper trained with RLlib; what its table leaves to that library is stable-baselines3's default here: value
 loss weight 0.5, gradients clipped to norm 0.5, advantages normalised, Adam with epsilon 1e-5, no KL penalty.
@@ -23,6 +23,7 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.utils import configure_logger
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agent_client.checkpoint import write_checkpoint
@@ -36,7 +37,7 @@ from agent_client.kinematic import KinematicPlant
 from agent_client.sb3_policy import ACTIVATIONS, AsymmetricPolicy, actor_of
 from agent_client.start import RegisterWalls
 from agent_client.training_log import EpisodeMeans, Progress, append_log, cut_log
-from agent_client.training_options import Hyperparameters, Imitation, TrainingOptions, fitting_minibatch
+from agent_client.training_options import IMITATED, Hyperparameters, TrainingOptions, fitting_minibatch
 from agent_client.training_state import TrainingState, comparable, read_state, write_state
 from agent_client.tubes import LEVELS, draw_pool
 from agent_client.world import TubeWorld
@@ -74,7 +75,8 @@ def train(
         open_session: opens the session to train in; None for the kinematic world of the paper.
         register_walls: for a plant with walls, see `TubeWorld`.
         resume: go on from the state beside the checkpoint, with new episodes. More steps than before stretch
-            the learning rate's schedule from there on.
+            the learning rate's schedule from there on. An imitation first flies a few rounds that fill its memory
+            (`agent_client.imitation.Imitator.begin`).
 
     Returns:
         The path of the checkpoint.
@@ -93,7 +95,8 @@ def train(
         engine = session.description.engine
         state = read_state(state_path(options.out), options, engine) if resume else None
         curriculum = Curriculum(replay=options.replay, level=options.first_level)
-        world = TubeWorld(session, pools, curriculum, options.world, options.seed, register_walls)
+        seed = _seed_of(options.seed, state.iteration if state else 0)
+        world = TubeWorld(session, pools, curriculum, options.world, seed, register_walls)
         env = VecNormalize(
             TubeVecEnv(world),
             norm_reward=False,
@@ -101,21 +104,27 @@ def train(
             gamma=hyper.gamma,
             epsilon=hyper.epsilon,
         )
-        model = _make_model(env, options, _seed_of(options.seed, state.iteration if state else 0))
-        watcher = _Watcher(options, model, curriculum, env, engine, on_progress)
+        model = _make_model(env, options, seed)
+        model.set_logger(_make_logger(options, fresh=state is None))
+        imitator = None
+        if options.imitation is not None:
+            rounds = options.iterations
+            imitator = Imitator(world, env, model.policy, hyper, options.imitation, rounds, seed)
+        optimiser = imitator.optimiser if imitator else model.policy.optimizer
+        watcher = _Watcher(options, model, optimiser, curriculum, env, engine, on_progress)
         if state is not None:
             watcher.restore(state)
         else:
             state_path(options.out).unlink(missing_ok=True)
         options.out.parent.mkdir(parents=True, exist_ok=True)
         cut_log(log_path(options.out), watcher.iteration)
-        if options.imitation is not None:
-            watcher.imitate(world, options.imitation)
-        # With counters that go on, stable-baselines3 adds the steps to those done.
-        if (left := options.steps - model.num_timesteps) > 0:
-            fresh = model.num_timesteps == 0
+        if imitator is not None:
+            watcher.imitate(imitator)
+        else:
+            # With counters that go on, stable-baselines3 adds the steps to those done.
+            left, fresh = options.steps - model.num_timesteps, model.num_timesteps == 0
             model.learn(left, callback=watcher, reset_num_timesteps=fresh)
-        watcher.save()
+            watcher.save()
     return options.out
 
 
@@ -137,7 +146,7 @@ def _make_model(env: VecNormalize, options: TrainingOptions, seed: int) -> PPO:
     first, last = hyper.learning_rate, hyper.final_learning_rate
     layers = list(hyper.hidden)
     seen = len(options.world.lags) * len(FEATURES)
-    model = PPO(
+    return PPO(
         AsymmetricPolicy if options.world.privileged else "MlpPolicy",
         env,
         learning_rate=first if first == last else _LinearRate(first, last),
@@ -154,14 +163,18 @@ def _make_model(env: VecNormalize, options: TrainingOptions, seed: int) -> PPO:
             "optimizer_kwargs": {"eps": 1e-5, "fused": True},  # fused: 10 % less time in an update
             **({"seen": seen} if options.world.privileged else {}),
         },
-        tensorboard_log=str(options.tensorboard) if options.tensorboard else None,
         seed=seed,
         device="cpu",
     )
+
+
+def _make_logger(options: TrainingOptions, *, fresh: bool) -> Logger:
+    """TensorBoard's, in a folder of its own or, when resumed, in the last one; or one that writes nothing."""
     if options.tensorboard is None:
-        # The default logger, though it would write nothing, leaves a folder in the temporary directory.
-        model.set_logger(Logger(folder=None, output_formats=[]))
-    return model
+        # stable-baselines3's default, though it would write nothing, leaves a folder in the temporary directory.
+        return Logger(folder=None, output_formats=[])
+    name = "PPO" if options.imitation is None else "imitation"
+    return configure_logger(0, str(options.tensorboard), name, fresh)
 
 
 @dataclass(frozen=True)
@@ -191,6 +204,7 @@ class _Watcher(BaseCallback):
         self,
         options: TrainingOptions,
         model: PPO,
+        optimiser: torch.optim.Optimizer,
         curriculum: Curriculum,
         env: VecNormalize,
         engine: str,
@@ -198,6 +212,7 @@ class _Watcher(BaseCallback):
     ) -> None:
         super().__init__()
         self.model = model
+        self._optimiser = optimiser
         self._options, self._curriculum, self._env, self._engine = options, curriculum, env, engine
         self._on_progress = on_progress
         self._total = options.iterations * options.hyperparameters.batch
@@ -209,33 +224,17 @@ class _Watcher(BaseCallback):
         self._begun = (time.perf_counter(), 0)
         """When training began or was resumed, and at which step."""
 
-    def imitate(self, world: TubeWorld, imitation: Imitation) -> None:
-        """Take the rounds of imitation that are not done yet; afterwards the normalisation stays as it is.
-
-        A resumed imitation begins with an empty memory, which its first rounds fill.
-        """
-        rounds = self._options.rounds
-        hyper, seed = self._options.hyperparameters, _seed_of(self._options.seed, self.iteration)
-        if self.iteration < rounds:
-            imitator = Imitator(world, self._env, self.model.policy, hyper, imitation, rounds, seed)
-            self._begun = (time.perf_counter(), self.model.num_timesteps)
-            while self.iteration < rounds:
-                imitator.round(self.iteration, self._means.add)
-                self.model.num_timesteps += hyper.batch
-                self.num_timesteps = self.model.num_timesteps
-                self._report()
-                self.save()
-        self._env.training = False
-
-    def _touch_policy(self) -> None:
-        """Let PPO touch the policy, once the value network has learnt to judge what imitation left."""
-        imitation = self._options.imitation
-        if imitation is None:
-            return
-        touched = self.iteration >= self._options.rounds + imitation.critic_rounds
-        policy = self.model.policy
-        for parameter in (*policy.mlp_extractor.policy_net.parameters(), *policy.action_net.parameters()):
-            parameter.requires_grad = touched
+    def imitate(self, imitator: Imitator) -> None:
+        """Take the rounds of imitation that are not done yet."""
+        imitator.begin(self.iteration)
+        self._begun = (time.perf_counter(), self.num_timesteps)
+        while self.iteration < self._options.iterations:
+            loss = imitator.round(self.iteration, self._means.add)
+            self.num_timesteps += self._options.hyperparameters.batch
+            self._report()
+            self.logger.record("tube/imitation_loss", loss)
+            self.logger.dump(self.num_timesteps)
+            self.save()
 
     def restore(self, state: TrainingState) -> None:
         """Go on where a state stood.
@@ -250,7 +249,7 @@ class _Watcher(BaseCallback):
             )
         model = self.model
         model.policy.load_state_dict(state.policy)
-        model.policy.optimizer.load_state_dict(state.optimiser)
+        self._optimiser.load_state_dict(dict(state.optimiser))
         model.num_timesteps = self.num_timesteps = state.steps
         seen = self._env.obs_rms
         seen.mean, seen.var, seen.count = state.mean.numpy(), state.variance.numpy(), state.count
@@ -273,21 +272,19 @@ class _Watcher(BaseCallback):
         # Before a batch, not after it: then the update that belongs to the last batch is done.
         if self.iteration > self._saved:
             self.save()
-        self._touch_policy()
 
     def _on_rollout_end(self) -> None:
-        progress = self._report()
-        for name in ("level", "success_rate", "mean_return", "mean_steps", "timeout_rate"):
-            self.logger.record(f"tube/{name}", getattr(progress, name))
+        self._report()
 
-    def _report(self) -> Progress:
-        """Count an iteration, and tell the log and the caller where training stands."""
+    def _report(self) -> None:
+        """Count an iteration, and tell the logs and the caller where training stands."""
         self.iteration += 1
         progress = self._progress()
         append_log(log_path(self._options.out), progress)
+        for name in ("level", "success_rate", "mean_return", "mean_steps", "timeout_rate"):
+            self.logger.record(f"tube/{name}", getattr(progress, name))
         if self._on_progress is not None:
             self._on_progress(progress)
-        return progress
 
     def _progress(self) -> Progress:
         then, before = self._begun
@@ -312,7 +309,7 @@ class _Watcher(BaseCallback):
             iteration=self.iteration,
             steps=self.num_timesteps,
             policy=policy.state_dict(),
-            optimiser=policy.optimizer.state_dict(),
+            optimiser=self._optimiser.state_dict(),
             mean=torch.from_numpy(seen.mean),
             variance=torch.from_numpy(seen.var),
             count=float(seen.count),
@@ -329,6 +326,9 @@ class _Watcher(BaseCallback):
         options, hyper, seen = self._options, self._options.hyperparameters, self._env.obs_rms
         layers, network = actor_of(self.model.policy, str(options.out))
         width = len(options.world.lags) * len(FEATURES)  # of what the policy sees
+        used = asdict(hyper)
+        if options.imitation is not None:  # PPO's numbers had no part in it
+            used = {name: used[name] for name in IMITATED}
         contract = running_contract(
             options.world.settings,
             options.dt,
@@ -350,7 +350,7 @@ class _Watcher(BaseCallback):
                 "conditions": [asdict(c) for c in (options.world.conditions, *options.world.rotation)],
                 "privileged": options.world.privileged,
                 "tubes": [asdict(recipe) for recipe in options.tubes],
-                "hyperparameters": asdict(hyper),
+                "hyperparameters": used,
                 "imitation": options.imitation and asdict(options.imitation),
                 "versions": _versions(),
             },

@@ -48,13 +48,17 @@ class Hyperparameters:
         return self.lanes * self.rollout
 
 
+IMITATED: Final = ("lanes", "rollout", "hidden", "activation", "observation_clip", "epsilon")
+"""The hyperparameters that imitation takes: the size of a round, the network, and the normalisation."""
+
+
 @dataclass(frozen=True)
 class Imitation:
-    """How a policy imitates the teacher (`agent_client.imitation`) before PPO goes on with it. Our addition."""
+    """How a policy imitates the teacher (`agent_client.imitation`) in place of PPO. Our addition.
 
-    rounds: int | None = None
-    """Iterations: each flies one batch of control steps and then learns from the samples kept so far. None for all
-    of the training's; after fewer, PPO goes on."""
+    Each iteration is a round: it flies one batch of control steps, then learns from the samples kept so far.
+    """
+
     teacher: TeacherOptions = field(default_factory=TeacherOptions)
     takeover: int = 8
     """Rounds over which the share of lanes that the teacher flies falls from all to none."""
@@ -70,8 +74,6 @@ class Imitation:
     final_learning_rate: float = 2e-5
     normalised_rounds: int = 5
     """Rounds that the observation's statistics are taken from; afterwards they stay."""
-    critic_rounds: int = 8
-    """Iterations of PPO in which the value network learns alone, before the policy is touched."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ class TrainingOptions:
     replay: float = 0.0
     """Share of episodes from earlier levels (`agent_client.curriculum`)."""
     imitation: Imitation | None = None
-    """How it imitates a teacher first; its rounds count as iterations and their steps as steps."""
+    """How it imitates a teacher; None to learn by PPO. Of the hyperparameters it takes `IMITATED` alone."""
     first_level: int = 0
     """Level that the curriculum begins at."""
     threads: int = 2
@@ -110,13 +112,6 @@ class TrainingOptions:
     def iterations(self) -> int:
         """Batches of control steps."""
         return -(-self.steps // self.hyperparameters.batch)
-
-    @property
-    def rounds(self) -> int:
-        """How many of them imitate."""
-        if self.imitation is None:
-            return 0
-        return self.iterations if self.imitation.rounds is None else self.imitation.rounds
 
 
 def fitting_minibatch(hyper: Hyperparameters) -> int:

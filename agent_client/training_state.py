@@ -39,7 +39,7 @@ class TrainingState:
     policy: Mapping[str, Any]
     """Tensors of the actor-critic policy."""
     optimiser: Mapping[str, Any]
-    """Adam's moments and step counts."""
+    """Adam's moments and step counts, of PPO or of the imitation; the imitation's memory is too large to keep."""
     mean: torch.Tensor  # (W,)
     """Running mean of the observations, float64."""
     variance: torch.Tensor  # (W,)

@@ -1,7 +1,8 @@
-"""Imitation before PPO, on small budgets."""
+"""Imitation in place of PPO, on small budgets."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,9 @@ import pytest
 
 pytest.importorskip("stable_baselines3", reason="the extra 'train' is not installed")
 
+import torch
+from tensorboard.backend.event_processing import event_accumulator
+
 from agent_client.checkpoint import read_checkpoint
 from agent_client.imitation import Memory
 from agent_client.settings import Settings
@@ -17,23 +21,23 @@ from agent_client.training import train
 from agent_client.training_log import Progress
 from agent_client.training_options import Hyperparameters, Imitation, TrainingOptions
 from agent_client.tubes import TubeRecipe
-from agent_client.world import WorldOptions
+from agent_client.world import TubeWorld, WorldOptions
 
 HYPER = Hyperparameters(lanes=26, rollout=50, minibatch=650, epochs=2, hidden=(64, 32))
 
 
 def options(out: Path, **changes: object) -> TrainingOptions:
-    """Ten rounds of imitation and two batches of PPO in tubes of 8 m, with two observations and a hidden view."""
+    """Ten rounds of imitation in tubes of 8 m, with two observations and a hidden view."""
     return replace(
         TrainingOptions(
             out,
-            steps=12 * HYPER.batch,
+            steps=10 * HYPER.batch,
             seed=2,
             world=WorldOptions(Settings(), lags=(0, 2), privileged=True),
             hyperparameters=HYPER,
             tubes=(TubeRecipe((8.0,)),),
             pool=20,
-            imitation=Imitation(rounds=10, takeover=2, minibatch=256, updates=40, critic_rounds=1),
+            imitation=Imitation(takeover=2, minibatch=256, updates=40),
             threads=1,
         ),
         **changes,
@@ -47,44 +51,79 @@ def weights(path: Path) -> list[np.ndarray]:
     return [part for layer in layers for part in (layer.weight, layer.bias)]
 
 
-def test_a_policy_learns_from_the_teacher_and_ppo_goes_on(tmp_path: Path) -> None:
-    """In the ninth round nearly every episode succeeds; PPO's batches are counted on, and repeat bit for bit."""
+class CutError(Exception):
+    """Raised to cut a training short."""
+
+
+def cut_at(iteration: int) -> Callable[[Progress], None]:
+    """A callback that cuts a training short when this round was flown, before it is saved."""
+
+    def cut(progress: Progress) -> None:
+        if progress.iteration == iteration:
+            raise CutError
+
+    return cut
+
+
+def test_a_policy_learns_from_the_teacher(tmp_path: Path) -> None:
+    """In the ninth round nearly every episode succeeds; all rounds imitate, and they repeat bit for bit."""
     seen: list[Progress] = []
     first = train(options(tmp_path / "a.zip"), seen.append)
-    assert [p.iteration for p in seen] == list(range(1, 13))
-    assert seen[-1].steps == 12 * HYPER.batch
+    assert [p.iteration for p in seen] == list(range(1, 11))
+    assert seen[-1].steps == 10 * HYPER.batch
     assert seen[8].batch_success > 0.9
     second = train(options(tmp_path / "b.zip"))
     for one, other in zip(weights(first), weights(second), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
-def test_the_critic_learns_alone_at_first(tmp_path: Path) -> None:
-    """In the first rounds of PPO the policy stays as imitation left it; afterwards it moves."""
-    imitated = weights(train(options(tmp_path / "a.zip", steps=10 * HYPER.batch)))
-    alone = weights(train(options(tmp_path / "b.zip", steps=11 * HYPER.batch)))
-    moved = weights(train(options(tmp_path / "c.zip", steps=12 * HYPER.batch)))
-    assert all(np.array_equal(a, b) for a, b in zip(imitated, alone, strict=True))
-    assert not any(np.array_equal(a, b) for a, b in zip(imitated, moved, strict=True))
+def test_the_contract_has_the_numbers_that_were_used(tmp_path: Path) -> None:
+    """Those of the imitation, the size of a round, the network and the normalisation; none of PPO's."""
+    contract = read_checkpoint(train(options(tmp_path / "a.zip", steps=HYPER.batch))).contract
+    assert contract is not None
+    assert contract.training["imitation"]["updates"] == 40
+    assert contract.training["hyperparameters"] == {
+        "lanes": 26,
+        "rollout": 50,
+        "hidden": [64, 32],
+        "activation": "tanh",
+        "observation_clip": HYPER.observation_clip,
+        "epsilon": HYPER.epsilon,
+    }
 
 
-def test_an_imitation_that_was_cut_short_goes_on(tmp_path: Path) -> None:
-    """A state left by a round is resumed with the rounds that are missing, to the same number of steps."""
-
-    class CutError(Exception):
-        pass
-
-    def cut(progress: Progress) -> None:
-        if progress.iteration == 5:
-            raise CutError
-
+def test_an_imitation_that_was_cut_short_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rounds that are missing follow, with new draws and Adam's moments, and no worse than before the cut."""
+    seeds: list[int] = []
+    seed_world = TubeWorld.seed
+    monkeypatch.setattr(TubeWorld, "seed", lambda world, n: (seeds.append(n), seed_world(world, n))[1])
     path = tmp_path / "a.zip"
+    before: list[Progress] = []
     with pytest.raises(CutError):
-        train(options(path), cut)
+        train(options(path), lambda p: (before.append(p), cut_at(8)(p))[0])
+    begun = set(seeds)
+    seeds.clear()
+    state = torch.load(path.with_suffix(".state"), weights_only=True)
+    assert {float(moments["step"]) for moments in state["optimiser"]["state"].values()} == {7 * 40.0}
+
     seen: list[Progress] = []
     train(options(path), seen.append, resume=True)
-    assert [p.iteration for p in seen] == list(range(5, 13))
-    assert seen[-1].steps == 12 * HYPER.batch
+    assert [p.iteration for p in seen] == [8, 9, 10]
+    assert [p.steps for p in seen] == [n * HYPER.batch for n in (8, 9, 10)]
+    assert not begun & set(seeds)
+    assert seen[0].batch_success > before[-1].batch_success - 0.1
+    assert seen[-1].batch_success > 0.9
+    state = torch.load(path.with_suffix(".state"), weights_only=True)
+    assert {float(moments["step"]) for moments in state["optimiser"]["state"].values()} == {10 * 40.0}
+
+
+def test_an_imitation_is_seen_in_tensorboard(tmp_path: Path) -> None:
+    """The same values as of PPO, and the loss, one of each a round."""
+    train(options(tmp_path / "a.zip", steps=2 * HYPER.batch, tensorboard=tmp_path / "logs"))
+    events = event_accumulator.EventAccumulator(str(next((tmp_path / "logs").iterdir())))
+    events.Reload()
+    for name in ("level", "success_rate", "mean_return", "mean_steps", "timeout_rate", "imitation_loss"):
+        assert [event.step for event in events.Scalars(f"tube/{name}")] == [HYPER.batch, 2 * HYPER.batch]
 
 
 def test_the_memory_keeps_the_newest() -> None:
