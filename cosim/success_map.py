@@ -62,7 +62,7 @@ def draw_map(path: Path, report: dict[str, Any]) -> None:
         if i == len(levels) - 1:
             panel.set_xlabel("gain k_v (1/s)")
         if j == 0:
-            panel.set_ylabel("gravity compensation c (weight)")
+            panel.set_ylabel("compensation c\n(weight)")
     figure.colorbar(image, ax=panels, label="success (%)", shrink=0.9)
     hard = ", hard conditions otherwise" if report["hard"] else ""
     title = (

@@ -12,6 +12,9 @@ import pytest
 from flights import Done, run_cosim, run_here
 
 from agent_client.tubes import TubeRecipe, draw_tube
+from cosim.inputs import setting_notes
+from cosim.named_settings import NamedSettings
+from cosim.options import FlightOptions, TubeChoice
 from cosim.runs import read_run
 from meshes.tube import read_tube
 
@@ -51,6 +54,31 @@ def test_an_evaluated_episode_is_flown_again_bit_for_bit(
             assert report[key] == episode[key], (key, episode["launch"])
         drawn = manifest_of(tmp_path / f"again{index}")["conditions"]["drawn"]
         assert drawn == episode["conditions"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (FlightOptions(settings=NamedSettings(True)), ["--hard: on a mesh"]),
+        (FlightOptions(tube=TubeChoice(2, 1), settings=NamedSettings(True)), []),
+        (FlightOptions(settings=NamedSettings(False, {"mass": (2.0, 2.0)})), ["--mass: the law"]),
+        (
+            FlightOptions(
+                settings=NamedSettings(False, {"mass": (2.0, 2.0)}), parameters=("disturbance_x=1",)
+            ),
+            [],
+        ),
+        (
+            FlightOptions(tube=TubeChoice(1, 1), settings=NamedSettings(False, {}, {"curvature_cap": 0.5})),
+            ["--curvature-cap: at level 1"],
+        ),
+    ],
+)
+def test_what_changes_nothing_of_a_flight_is_said(options: FlightOptions, words: list[str]) -> None:
+    """A note for the tubes of --hard where a mesh is flown, and for each setting that is idle under the others."""
+    notes = list(setting_notes(options, *options.settings.resolve()))
+    assert len(notes) == len(words)
+    assert all(note.startswith(word) for note, word in zip(notes, words, strict=True))
 
 
 def test_the_run_folder_has_the_tube(fly: Callable[..., Done], tmp_path: Path) -> None:
