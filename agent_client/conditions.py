@@ -144,6 +144,11 @@ class Conditions:
         usual = Conditions().ranges()
         return {name: span for name, span in self.ranges().items() if span != usual[name]}
 
+    def without_inertia(self) -> Conditions:
+        """These conditions for a world without inertia: what only inertia gives a meaning to is as usual."""
+        usual = Conditions().ranges()
+        return self.with_ranges({row.name: usual[row.name] for row in CONDITIONS if row.needs_inertia})
+
     def with_ranges(self, ranges: Mapping[str, Range]) -> Conditions:
         """These conditions with some ranges replaced.
 

@@ -112,6 +112,17 @@ PRESETS: Final[Mapping[str, Preset]] = MappingProxyType(
 )
 
 
+def without_inertia(options: TrainingOptions) -> TrainingOptions:
+    """The options for the kinematic world: no conditions that need inertia, no teacher that lifts against gravity."""
+    world, imitation = options.world, options.imitation
+    conditions = world.conditions.without_inertia()
+    rotation = tuple(other.without_inertia() for other in world.rotation)
+    if imitation is not None:
+        imitation = replace(imitation, teacher=replace(imitation.teacher, gravity=0.0))
+    world = replace(world, conditions=conditions, rotation=rotation)
+    return replace(options, world=world, imitation=imitation)
+
+
 def preset_options(name: str, out: Path, *, seed: int | None = None) -> TrainingOptions:
     """The options of a preset, with a checkpoint to write and, unless None, a seed."""
     options = replace(PRESETS[name].options, out=out)

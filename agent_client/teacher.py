@@ -47,6 +47,8 @@ class TeacherOptions:
     """How much faster than the plant the velocity is corrected (1/s)."""
     cone: float = math.radians(60.0)
     """Greatest angle between w and v* (rad)."""
+    gravity: float = GRAVITY
+    """What pulls at the drones (m/s^2): the plant's default; 0 in the kinematic world."""
     sharpness: float = 16.0
     """How sharply its choice among actions falls off with the square of what they miss w by (s^2/m^2)."""
 
@@ -84,7 +86,7 @@ class Teacher:
         wanted = self._options.speed * self._speed_max * way
         gain = drawn["gain"][:, None]
         command = wanted + lead / gain * (wanted - poses.linear_velocity)
-        command[:, 2] += (1.0 - drawn["compensation"]) * GRAVITY / drawn["gain"]
+        command[:, 2] += (1.0 - drawn["compensation"]) * self._options.gravity / drawn["gain"]
         along = (command * way).sum(axis=1, keepdims=True)
         across = command - along * way
         least = np.linalg.norm(across, axis=1, keepdims=True) / math.tan(self._options.cone) + SLOWEST

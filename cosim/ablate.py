@@ -16,13 +16,12 @@ import click
 from agent_client.ablations import ABLATIONS, Ablation, first_passed, masked
 from agent_client.conditions import HARD, Conditions
 from agent_client.evaluation import Score, draw_episodes, summarise
-from agent_client.presets import PRESETS, UNKNOWN_TUBE, Dynamics
+from agent_client.presets import PRESETS, UNKNOWN_TUBE, Dynamics, without_inertia
 from agent_client.training_log import Progress
 from agent_client.training_options import TrainingOptions
 from agent_client.tubes import HARD_TUBES, LEVELS, PAPER_TUBES, TubeRecipe
 from cosim.ablation_table import table_lines
 from cosim.errors import CosimError, Terminated
-from cosim.evaluation_plan import INERTIA_ALONE
 from cosim.evaluation_report import PAPER_SUCCESS
 from cosim.folders import RESULTS, results_folder, write_results
 from cosim.pilots import PilotChoice
@@ -137,9 +136,10 @@ def make_plan(options: AblateOptions) -> Plan:
     dynamics = options.dynamics or preset.dynamics
     conditions, recipe = (HARD, HARD_TUBES) if options.hard else (Conditions(), PAPER_TUBES)
     if dynamics == "kinematic":
-        usual = Conditions().ranges()
-        conditions = conditions.with_ranges({name: usual[name] for name in INERTIA_ALONE})
+        conditions = conditions.without_inertia()
     base = _base(options, conditions)
+    if dynamics == "kinematic":
+        base = without_inertia(base)
     variants, left_out = [], []
     for ablation in _named(options.variants):
         changed = ablation.apply(base)

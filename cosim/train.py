@@ -201,10 +201,12 @@ def _begin_folder(folder: Path, arguments: TrainArguments) -> None:
 
 def _options(folder: Path, arguments: TrainArguments) -> TrainingOptions:
     """The preset's options with what the user asked."""
-    from agent_client.presets import PRESETS
+    from agent_client.presets import PRESETS, without_inertia
 
     assert arguments.preset is not None
     options = PRESETS[arguments.preset].options
+    if arguments.dynamics == "kinematic":
+        options = without_inertia(options)
     lanes = arguments.envs or options.hyperparameters.lanes
     # PyBullet reads a wall in 0.1 s: with pools no larger than what stays registered, it reads each one once.
     pool = wall_slots(lanes) // LEVELS if arguments.engine == "bullet" else options.pool
@@ -222,6 +224,8 @@ def _options(folder: Path, arguments: TrainArguments) -> TrainingOptions:
 def _announcement(options: TrainingOptions, arguments: TrainArguments, *, resumed: bool) -> str:
     engine = f" integrated by {arguments.engine}" if arguments.engine else ""
     anew = "; episodes that were under way begin anew" if resumed else ""
+    if resumed and options.imitation is not None:
+        anew += ", and a few rounds that count for nothing fill the memory of the imitation first"
     return (
         f"{'resuming' if resumed else 'training'} '{options.preset}' to {options.steps:,} steps, seed "
         f"{options.seed}: {options.hyperparameters.lanes} drones, {arguments.dynamics} dynamics{engine}, pools of "

@@ -25,7 +25,7 @@ from agent_client.contract import Normalisation, require_match, running_contract
 from agent_client.errors import PolicyError, TrainingError
 from agent_client.paper import CHOICES, to_markdown
 from agent_client.policy import load_policy
-from agent_client.presets import PRESETS, UNKNOWN_TUBE
+from agent_client.presets import PRESETS, UNKNOWN_TUBE, without_inertia
 from agent_client.settings import Settings
 from agent_client.training import log_path, state_path, train
 from agent_client.training_log import Progress, read_log
@@ -337,6 +337,17 @@ def test_the_presets_are_what_they_are_called() -> None:
     assert set(robust.options.world.settings.masked_features) == set(UNKNOWN_TUBE)
     assert robust.dynamics == "rigid-body"
     assert all(preset.options.preset == name for name, preset in PRESETS.items())
+
+
+def test_a_recipe_without_inertia_is_taught_without_gravity() -> None:
+    """In the kinematic world no episode draws what only inertia gives a meaning to, and the teacher lifts nothing."""
+    options = without_inertia(PRESETS["robust"].options)
+    for conditions in (options.world.conditions, *options.world.rotation):
+        assert (conditions.gain, conditions.compensation) == ((8.0, 8.0), (0.9, 0.9))
+        assert conditions.body_radius == (0.15, 0.25)
+    assert options.imitation is not None
+    assert options.imitation.teacher.gravity == 0.0
+    assert without_inertia(PRESETS["paper"].options) == PRESETS["paper"].options
 
 
 def test_the_papers_open_values_are_in_the_document() -> None:
