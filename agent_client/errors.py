@@ -25,6 +25,10 @@ class TrainingError(AgentError):
     """A training's files that do not fit; the message names the file and what to do."""
 
 
+class TrainingOver(TrainingError):  # noqa: N818 - it is named after what it finds
+    """A training to be resumed whose steps are all done."""
+
+
 class PolicyError(AgentError):
     """A checkpoint that cannot be flown; the message names the file and what to do."""
 

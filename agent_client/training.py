@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import platform
 import time
+import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
@@ -30,13 +31,13 @@ from agent_client.checkpoint import write_checkpoint
 from agent_client.contract import Normalisation, running_contract
 from agent_client.curriculum import Curriculum
 from agent_client.environment import TubeVecEnv
-from agent_client.errors import TrainingError
+from agent_client.errors import TrainingOver
 from agent_client.features import FEATURES
 from agent_client.imitation import Imitator
 from agent_client.kinematic import KinematicPlant
 from agent_client.sb3_policy import ACTIVATIONS, AsymmetricPolicy, actor_of
 from agent_client.start import RegisterWalls
-from agent_client.training_log import EpisodeMeans, Progress, append_log, cut_log
+from agent_client.training_log import EpisodeMeans, Progress, append_log, cut_log, writing
 from agent_client.training_options import IMITATED, Hyperparameters, TrainingOptions, fitting_minibatch
 from agent_client.training_state import TrainingState, comparable, read_state, write_state
 from agent_client.tubes import LEVELS, draw_pool
@@ -66,6 +67,7 @@ def train(
     *,
     register_walls: RegisterWalls | None = None,
     resume: bool = False,
+    on_note: Callable[[str], None] = warnings.warn,
 ) -> Path:
     """Train a policy and write its checkpoint; the same options give the same policy on the same machine.
 
@@ -77,13 +79,14 @@ def train(
         resume: go on from the state beside the checkpoint, with new episodes. More steps than before stretch
             the learning rate's schedule from there on. An imitation first flies a few rounds that fill its memory
             (`agent_client.imitation.Imitator.begin`).
+        on_note: told what a resumed training goes on without.
 
     Returns:
         The path of the checkpoint.
 
     Raises:
-        TrainingError: nothing to resume, or a state of other options.
-        OSError: a file cannot be written.
+        TrainingError: nothing to resume, a state of other options, or a file that cannot be written.
+        TrainingOver: all steps of the training to resume are done.
     """
     _prepare_torch(options.threads)
     hyper = replace(options.hyperparameters, minibatch=fitting_minibatch(options.hyperparameters))
@@ -115,9 +118,14 @@ def train(
         if state is not None:
             watcher.restore(state)
         else:
-            state_path(options.out).unlink(missing_ok=True)
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        cut_log(log_path(options.out), watcher.iteration)
+            with writing(options.out):
+                state_path(options.out).unlink(missing_ok=True)
+                options.out.parent.mkdir(parents=True, exist_ok=True)
+        log = log_path(options.out)
+        if missing := cut_log(log, watcher.iteration):
+            on_note(
+                f"{log}: {missing} of {watcher.iteration} iterations are missing; it goes on without them"
+            )
         if imitator is not None:
             watcher.imitate(imitator)
         else:
@@ -174,7 +182,8 @@ def _make_logger(options: TrainingOptions, *, fresh: bool) -> Logger:
         # stable-baselines3's default, though it would write nothing, leaves a folder in the temporary directory.
         return Logger(folder=None, output_formats=[])
     name = "PPO" if options.imitation is None else "imitation"
-    return configure_logger(0, str(options.tensorboard), name, fresh)
+    with writing(options.tensorboard):
+        return configure_logger(0, str(options.tensorboard), name, fresh)
 
 
 @dataclass(frozen=True)
@@ -240,10 +249,10 @@ class _Watcher(BaseCallback):
         """Go on where a state stood.
 
         Raises:
-            TrainingError: all steps are done.
+            TrainingOver: all steps are done.
         """
         if state.steps >= self._options.steps:
-            raise TrainingError(
+            raise TrainingOver(
                 f"{state_path(self._options.out)}: expected a training that is not over, found {state.steps} of "
                 f"{self._options.steps} steps done; ask for more steps in all"
             )
@@ -318,7 +327,8 @@ class _Watcher(BaseCallback):
             results=self._curriculum.results,
             recent=list(self._means.recent),
         )
-        write_state(state_path(out), state)
+        with writing(state_path(out)):
+            write_state(state_path(out), state)
         self._saved = self.iteration
 
     def _write_policy(self) -> None:
@@ -358,7 +368,8 @@ class _Watcher(BaseCallback):
         )
         buffer = io.BytesIO()
         self.model.save(buffer, exclude=_NOT_THE_POLICY)
-        write_checkpoint(options.out, buffer.getvalue(), contract, layers)
+        with writing(options.out):
+            write_checkpoint(options.out, buffer.getvalue(), contract, layers)
 
 
 def _versions() -> dict[str, Any]:

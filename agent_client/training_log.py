@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import math
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any, Final, TypeAlias
@@ -89,26 +90,60 @@ def _means(episodes: Sequence[Ended] | deque[Ended]) -> list[float]:
     return means
 
 
-def cut_log(path: Path, iterations: int) -> None:
-    """Begin a log, or take back the rows after an iteration, which a killed training wrote and then lost.
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """What is done inside writes a file of a training.
 
     Raises:
-        TrainingError: there is no log of so many iterations.
+        TrainingError: it cannot be written; says why.
     """
-    lines = [",".join(field.name for field in fields(Progress))]
-    if iterations:
-        rows = path.read_text().splitlines()[1:] if path.exists() else []
-        if len(rows) < iterations:
-            raise TrainingError(
-                f"{path}: expected the log of {iterations} iterations, found {len(rows)} rows"
+    try:
+        yield
+    except OSError as error:
+        raise TrainingError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def cut_log(path: Path, iterations: int) -> int:
+    """Begin a log, or take back the rows after an iteration, which a killed training wrote and then lost.
+
+    In one piece: after a kill the file is the old one or the new one.
+
+    Returns:
+        How many rows up to that iteration are missing, as after a copy without the log.
+
+    Raises:
+        TrainingError: it cannot be written.
+    """
+    rows: list[str] = []
+    if iterations and path.exists():
+        text = path.read_text(errors="replace")
+        whole = text[: text.rfind("\n") + 1].splitlines()[1:]
+        rows = [row for row in whole if _number_of(row) in range(1, iterations + 1)]
+    temporary = path.with_name(f".{path.name}.new")
+    with writing(path):
+        try:
+            temporary.write_text(
+                "\n".join([",".join(field.name for field in fields(Progress)), *rows]) + "\n"
             )
-        lines += rows[:iterations]
-    path.write_text("\n".join(lines) + "\n")
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    return iterations - len(rows)
+
+
+def _number_of(row: str) -> int | None:
+    """The iteration of a row, None where it is none."""
+    first = row.split(",", 1)[0]
+    return int(first) if first.isdecimal() else None
 
 
 def append_log(path: Path, progress: Progress) -> None:
-    """Add the row of an iteration."""
-    with path.open("a", newline="") as file:
+    """Add the row of an iteration.
+
+    Raises:
+        TrainingError: it cannot be written.
+    """
+    with writing(path), path.open("a", newline="") as file:
         csv.writer(file, lineterminator="\n").writerow(astuple(progress))
 
 

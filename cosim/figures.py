@@ -10,7 +10,7 @@ import numpy as np
 
 from agent_client.curriculum import THRESHOLDS
 from agent_client.training_log import Progress, read_log
-from cosim.errors import CosimError
+from cosim.errors import CosimError, OutputError
 
 SUCCESS: Final = "success.png"
 RETURN: Final = "return.png"
@@ -31,6 +31,7 @@ def draw_figures(log: Path, folder: Path) -> tuple[Path, Path]:
     Raises:
         TrainingError: there is no log.
         CosimError: it has no iteration yet, or matplotlib is not installed.
+        OutputError: a figure cannot be written.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -48,7 +49,10 @@ def draw_figures(log: Path, folder: Path) -> tuple[Path, Path]:
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
         _draw(axes, rows, kind)
-        figure.savefig(path, dpi=150)
+        try:
+            figure.savefig(path, dpi=150)
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
     return paths
 
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TextIO
 
 import click
 
+from agent_client.errors import TrainingOver
 from cosim.errors import CosimError, OutputError, Terminated
 from cosim.figures import draw_figures
 from cosim.sessions import server_session
@@ -68,31 +70,43 @@ def train(arguments: TrainArguments, out: Path | None, resume: Path | None) -> N
         _refuse_training(folder)
         arguments = _completed(arguments)
     run = load_training()
-    if resume is None:
-        _begin_folder(folder, arguments)
+    with _alone_in(folder, resume is None) as kept:
+        if resume is None:
+            _refuse_training(folder)  # once more: another may have begun and ended since
+            _write_arguments(kept, arguments)
+        written = _run(run, folder, arguments, resumed=resume is not None)
+        for figure in draw_figures(folder / LOG, folder):
+            click.echo(figure, err=True)
+    click.echo(written)
+
+
+def _run(run: Callable[..., Path], folder: Path, arguments: TrainArguments, *, resumed: bool) -> Path:
+    """Train with the display; says on stderr what is left where it is stopped, and where all steps are done."""
     options = _options(folder, arguments)
-    click.echo(_announcement(options, arguments, resumed=resume is not None), err=True)
+    click.echo(_announcement(options, arguments, resumed=resumed), err=True)
     try:
         with TrainingDisplay(options.steps) as display:
-            written = run(
+            return run(
                 options,
                 display.update,
                 _opener(arguments),
                 **_walls(options, arguments),
-                resume=resume is not None,
+                resume=resumed,
+                on_note=lambda text: click.echo(text, err=True),
             )
+    except TrainingOver:
+        click.echo(f"all {options.steps:,} steps are done; for more, add --steps", err=True)
+        return options.out
     except (KeyboardInterrupt, Terminated):
         if (folder / STATE).exists():
             text = f"training stopped; {options.out} is its last iteration; go on with: cosim train --resume {folder}"
         else:
-            text = "training stopped before its first iteration was completed; nothing was kept"
+            text = (
+                f"training stopped before its first iteration was completed: {folder} holds no policy, only "
+                f"arguments and logs; begin anew with --out {folder}"
+            )
         click.echo(text, err=True)
         raise
-    except OSError as error:
-        raise OutputError(f"--out {folder}: cannot be written: {error.strerror}") from error
-    for figure in draw_figures(folder / LOG, folder):
-        click.echo(figure, err=True)
-    click.echo(written)
 
 
 def limit_spinning() -> None:
@@ -154,8 +168,11 @@ def _resumed(folder: Path, given: TrainArguments) -> TrainArguments:
     """The arguments that a training was begun with, and the new number of steps if one is given.
 
     Raises:
-        CosimError: the folder holds no training, or an argument is given that cannot change.
+        CosimError: the folder holds no training or one of an unknown preset, or an argument is given that cannot
+            change.
     """
+    from agent_client.presets import PRESETS
+
     path = folder / ARGUMENTS
     try:
         begun = TrainArguments(**json.loads(path.read_text()))
@@ -163,6 +180,11 @@ def _resumed(folder: Path, given: TrainArguments) -> TrainArguments:
         raise CosimError(
             f"--resume {folder}: expected the folder of a training, found no {ARGUMENTS} that can be read ({error})"
         ) from error
+    if begun.preset not in PRESETS:
+        raise CosimError(
+            f"{path}: expected a preset out of {', '.join(PRESETS)}, found {begun.preset!r}; resume with the version "
+            "that the training was begun with"
+        )
     for field in fields(TrainArguments):
         value, before = getattr(given, field.name), getattr(begun, field.name)
         if field.name != "steps" and value not in (None, before):
@@ -186,17 +208,49 @@ def _refuse_training(folder: Path) -> None:
             )
 
 
-def _begin_folder(folder: Path, arguments: TrainArguments) -> None:
-    """Make the folder of a new training and keep its arguments there.
+@contextmanager
+def _alone_in(folder: Path, new: bool) -> Iterator[TextIO]:
+    """Hold the folder of a training, by a lock on its arguments that the kernel releases even after a kill.
+
+    Args:
+        folder: of the training; made if it is new.
+        new: whether it begins.
+
+    Returns:
+        The file of the arguments, open to be written.
+
+    Raises:
+        OutputError: another training runs in it, or it cannot be written.
+    """
+    option = "--out" if new else "--resume"
+    with ExitStack() as stack:
+        try:
+            if new:
+                folder.mkdir(parents=True, exist_ok=True)
+            file = stack.enter_context((folder / ARGUMENTS).open("a"))
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise OutputError(
+                f"{option} {folder}: expected a folder in which no training runs, found one that does; wait for its "
+                "end, stop it, or name another folder"
+            ) from None
+        except OSError as error:
+            raise OutputError(f"{option} {folder}: cannot be written: {error.strerror}") from error
+        yield file
+
+
+def _write_arguments(file: TextIO, arguments: TrainArguments) -> None:
+    """Keep the arguments of a new training in the file that `_alone_in` holds.
 
     Raises:
         OutputError: it cannot be written.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / ARGUMENTS).write_text(json.dumps(asdict(arguments), indent=1) + "\n")
+        file.truncate(0)
+        file.write(json.dumps(asdict(arguments), indent=1) + "\n")
+        file.flush()
     except OSError as error:
-        raise OutputError(f"--out {folder}: cannot be written: {error.strerror}") from error
+        raise OutputError(f"{file.name}: cannot be written: {error.strerror}") from error
 
 
 def _options(folder: Path, arguments: TrainArguments) -> TrainingOptions:

@@ -22,7 +22,7 @@ from stable_baselines3 import DQN, PPO
 import agent_client.paper
 from agent_client.checkpoint import read_checkpoint
 from agent_client.contract import Normalisation, require_match, running_contract
-from agent_client.errors import PolicyError, TrainingError
+from agent_client.errors import PolicyError, TrainingError, TrainingOver
 from agent_client.paper import CHOICES, to_markdown
 from agent_client.policy import load_policy
 from agent_client.presets import PRESETS, UNKNOWN_TUBE, without_inertia
@@ -264,6 +264,20 @@ def test_a_resumed_training_repeats_itself(tmp_path: Path) -> None:
     ]
 
 
+def test_a_training_goes_on_without_the_rows_that_its_log_lost(tmp_path: Path) -> None:
+    """What is missing is said once; the rows that follow have their own numbers, and no half row stays."""
+    stopped_after(2, options(tmp_path / "a.zip"))
+    log = tmp_path / "a.csv"
+    head, first, *_ = log.read_text().splitlines()
+    log.write_text(f"{head}\n{first}\n2,12")
+    notes: list[str] = []
+    train(options(tmp_path / "a.zip"), resume=True, on_note=notes.append)
+    assert len(notes) == 1
+    assert "1 of 2 iterations are missing" in notes[0]
+    assert [row.iteration for row in read_log(log)] == [1, 3]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.csv", "a.state", "a.zip"]
+
+
 def test_a_training_without_a_state_cannot_be_resumed(tmp_path: Path) -> None:
     """The message says that no iteration was completed, or that the file is damaged."""
     with pytest.raises(
@@ -282,7 +296,7 @@ def test_a_training_is_not_resumed_with_other_options(tmp_path: Path) -> None:
         TrainingError, match=r"other options: hyperparameters\.gamma: expected 0\.99, found 0\.5;"
     ):
         train(options(tmp_path / "a.zip", hyperparameters=replace(SMALL, gamma=0.5)), resume=True)
-    with pytest.raises(TrainingError, match="found 192 of 180 steps done; ask for more steps"):
+    with pytest.raises(TrainingOver, match="found 192 of 180 steps done; ask for more steps"):
         train(options(tmp_path / "a.zip"), resume=True)
     train(options(tmp_path / "a.zip", steps=256), resume=True)
     assert load_policy(tmp_path / "a.zip").contract.training["steps"] == 256
