@@ -278,10 +278,12 @@ def test_ctrl_c_keeps_what_is_trained_and_leaves_nothing_else(tmp_path: Path, wo
     """SIGINT to all, as a terminal sends it: status 130, whole checkpoints, no table, no process, no scratch file."""
     temporary, out = tmp_path / "temporary", tmp_path / "out"
     temporary.mkdir()
+    # Importing torch makes a cache folder among the temporary files, which is none of ours.
+    elsewhere = {"TMPDIR": str(temporary), "TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "torch")}
     process = subprocess.Popen(
         command("ablate", *TINY, "--seeds", "500", "--workers", workers, "--out", str(out)),
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, start_new_session=True,
-        env=environment() | {"TMPDIR": str(temporary)},
+        env=environment() | elsewhere,
     )  # fmt: skip
     watchdog = threading.Timer(DEADLINE, process.kill)
     watchdog.start()
