@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import tempfile
 import zipfile
 import zlib
@@ -32,9 +33,11 @@ ACTOR_FILE: Final = "actor.npz"
 SB3_FILES: Final = ("data", "policy.pth")
 """What every stable-baselines3 .zip holds."""
 
-# Entries carry this date, and the machine is left out, so that the same policy is the same file.
+# Entries carry this date, and the machine and its addresses are left out, so that the same policy is the same file.
 _DATE: Final = (2000, 1, 1, 0, 0, 0)
 _SYSTEM_INFO: Final = "system_info.txt"
+_ADDRESS: Final = re.compile(rb"at 0x[0-9a-f]+")
+"""In what stable-baselines3 prints of functions, for a reader's eye alone."""
 
 _DAMAGE: Final = (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, UnicodeDecodeError)
 """What `zipfile` raises for archives that cannot be read; RuntimeError stands for encrypted entries."""
@@ -122,7 +125,8 @@ def write_checkpoint(path: Path, sb3_zip: bytes, contract: Contract, layers: Seq
                 _put(target, ACTOR_FILE, _layer_bytes(layers))
                 for entry in source.namelist():
                     if entry != _SYSTEM_INFO:
-                        _put(target, entry, source.read(entry))
+                        content = source.read(entry)
+                        _put(target, entry, _ADDRESS.sub(b"at 0x0", content) if entry == "data" else content)
             file.flush()
             os.fsync(file.fileno())
         temporary.chmod(0o644)  # mkstemp's 0600 would keep others from reading a shared checkpoint
