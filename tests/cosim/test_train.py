@@ -74,7 +74,10 @@ def test_a_policy_trained_by_the_command_can_be_flown(tmp_path: Path, session_na
 
 
 def test_a_training_survives_kills_and_stops(tmp_path: Path) -> None:
-    """After kill -9 `--resume` needs nothing else and loses at most one iteration; Ctrl-C keeps the last one."""
+    """After kill -9 `--resume` needs nothing else and loses at most one iteration; Ctrl-C keeps the last one.
+
+    While it runs a second one in its folder is refused; when all is done, it is said and the figures are drawn.
+    """
     out = tmp_path / "mine"
     process = started("train", *TINY, "--steps", "400000", "--out", "mine", cwd=tmp_path)
     wait_for_iterations(process, out, 3)
@@ -85,10 +88,13 @@ def test_a_training_survives_kills_and_stops(tmp_path: Path) -> None:
 
     process = started("train", "--resume", "mine", cwd=tmp_path)
     wait_for_iterations(process, out, collected + 2)
+    second = run_cosim("train", "--resume", "mine", cwd=tmp_path)
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=DEADLINE)
     assert process.returncode == 130
     assert "episodes that were under way begin anew" in said
+    assert second.status == 2
+    assert "--resume mine: expected a folder in which no training runs" in second.stderr
     first = next(line for line in said.splitlines() if line.startswith("iteration"))
     assert int(first.split()[1]) in (collected, collected + 1)
     assert "go on with: cosim train --resume mine" in said.strip().splitlines()[-1]
@@ -99,6 +105,20 @@ def test_a_training_survives_kills_and_stops(tmp_path: Path) -> None:
     assert ended.status == 0, ended.stderr
     assert [row.steps for row in read_log(out / "policy.csv")] == list(range(800, steps + 1, 800))
     assert load_policy(out / "policy.zip").contract.training["steps"] == steps
+    (out / "success.png").unlink()
+    again = run_cosim("train", "--resume", "mine", cwd=tmp_path)
+    assert again.status == 0, again.stderr
+    assert "steps are done; for more, add --steps" in again.stderr
+    assert (out / "success.png").exists()
+
+
+def test_the_same_training_is_the_same_file(tmp_path: Path) -> None:
+    """Two processes that train alike write the same checkpoint, byte for byte."""
+    for name in ("one", "two"):
+        done = run_cosim("train", *TINY, "--steps", "800", "--out", name, cwd=tmp_path)
+        assert done.status == 0, done.stderr
+    one, two = ((tmp_path / name / "policy.zip").read_bytes() for name in ("one", "two"))
+    assert one == two
 
 
 @pytest.mark.parametrize(("engine", "name"), [("reference", "reference 1"), ("bullet", "bullet")])
@@ -151,6 +171,9 @@ def test_a_training_goes_on_as_it_was_begun(tmp_path: Path) -> None:
         CosimError, match="--seed 2: expected that of the training that goes on, 1; leave it out"
     ):
         train(TrainArguments(seed=2), None, tmp_path)
+    (tmp_path / "training.json").write_text('{"preset": "quickest"}')
+    with pytest.raises(CosimError, match=r"training\.json: expected a preset out of .* found 'quickest'"):
+        train(TrainArguments(), None, tmp_path)
     with pytest.raises(CosimError, match="leave out --out"):
         train(TrainArguments(), tmp_path, tmp_path)
 
@@ -170,6 +193,8 @@ def test_figures_are_drawn_from_a_log_alone(tmp_path: Path) -> None:
     log.write_text(LOG)
     assert [path.name for path in draw_figures(log, tmp_path)] == ["success.png", "return.png"]
     assert all((tmp_path / name).read_bytes().startswith(PNG) for name in ("success.png", "return.png"))
+    with pytest.raises(OutputError, match=r"success\.png: cannot be written"):
+        draw_figures(log, tmp_path / "nowhere")
     log.write_text(LOG[: LOG.index("\n") + 1])
     with pytest.raises(CosimError, match="expected at least one iteration"):
         draw_figures(log, tmp_path)
