@@ -106,7 +106,7 @@ def test_a_training_survives_kills_and_stops(tmp_path: Path) -> None:
     assert [row.steps for row in read_log(out / "policy.csv")] == list(range(800, steps + 1, 800))
     assert load_policy(out / "policy.zip").contract.training["steps"] == steps
     (out / "success.png").unlink()
-    again = run_cosim("train", "--resume", "mine", cwd=tmp_path)
+    again = run_cosim("train", "--resume", "mine", "--steps", str(steps), cwd=tmp_path)
     assert again.status == 0, again.stderr
     assert "steps are done; for more, add --steps" in again.stderr
     assert (out / "success.png").exists()
