@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -14,6 +16,7 @@ from typing import Any, Final
 from cosim.errors import PEER, OutputError, exit_status
 from cosim.recording import LOG, MANIFEST
 from cosim.supervise import LOGS
+from protocol.signals import held_signals
 
 RESULTS: Final = "results.json"
 """File of what many flights came to."""
@@ -135,3 +138,20 @@ def _make_free(label: str) -> tuple[Path, list[Path]]:
         except FileExistsError:
             continue
     raise AssertionError
+
+
+@contextmanager
+def scratch_folder(prefix: str) -> Iterator[Path]:
+    """A temporary folder that is gone at the end, whenever Ctrl-C comes.
+
+    `tempfile.TemporaryDirectory` loses the folder where an interrupt comes while it makes or removes it.
+    """
+    folder: Path | None = None
+    try:
+        with held_signals():
+            folder = Path(tempfile.mkdtemp(prefix=prefix))
+        yield folder
+    finally:
+        if folder is not None:
+            with held_signals():
+                shutil.rmtree(folder, ignore_errors=True)

@@ -22,7 +22,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from multiprocessing.connection import wait
-from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
 from agent_client.conditions import Conditions
@@ -33,6 +32,7 @@ from agent_client.training_options import TrainingOptions
 from agent_client.tubes import TubeRecipe
 from agent_client.tuning import Tuning, tune_pure_pursuit
 from cosim.errors import PEER, TERMINATED, OutputError, WorkerError, exit_status
+from cosim.folders import scratch_folder
 from cosim.live import counting
 from cosim.options import DEFAULT_PHYSICS_DT
 from cosim.pilots import ANY_DRONE, Pilot, PilotChoice, Terms, read_pilot
@@ -209,9 +209,9 @@ def _tune(job: TuneJob) -> Tuning:
 def _train(job: TrainJob) -> Trained:
     log: list[Progress] = []
     run, out = load_training(), job.options.out
-    with tempfile.TemporaryDirectory(prefix="cosim-train-") as scratch:
+    with scratch_folder("cosim-train-") as scratch:
         path = run(
-            replace(job.options, out=Path(scratch) / out.name),
+            replace(job.options, out=scratch / out.name),
             log.append,
             lambda settings: open_world(job.engine, settings.lanes, settings.dt),
         )
@@ -240,12 +240,12 @@ def crew(workers: int) -> Iterator[RunJobs]:
         with Worker() as worker:
             yield lambda jobs: map(worker.do, jobs)
         return
-    with tempfile.TemporaryDirectory(prefix="cosim-evaluate-") as folder:
+    with scratch_folder("cosim-evaluate-") as folder:
         executor = ProcessPoolExecutor(
             workers,
             multiprocessing.get_context("spawn"),
             initializer=_begin,
-            initargs=(folder,),
+            initargs=(str(folder),),
         )
 
         def run(jobs: Sequence[Job]) -> Iterator[Any]:
