@@ -24,7 +24,8 @@ MOMENTS = 24
 OPEN_ALONE = """
 import signal, sys
 import protocol.agent as agent
-signal.signal(signal.SIGTERM, signal.default_int_handler)
+for number in (signal.SIGINT, signal.SIGTERM):  # SIGINT too: a job in the background is born deaf to it
+    signal.signal(number, signal.default_int_handler)
 print("ready", flush=True)
 sys.stdin.readline()
 try:
