@@ -81,6 +81,9 @@ CONDITIONS: Final = (
 
 NAMES: Final = tuple(condition.name for condition in CONDITIONS)
 
+INERTIA_ALONE: Final = tuple(condition.name for condition in CONDITIONS if condition.needs_inertia)
+"""Conditions that have no meaning in a world without inertia."""
+
 _BY_NAME: Final = {condition.name: condition for condition in CONDITIONS}
 
 DRAWN: Final = np.dtype([*((name, "f8") for name in NAMES), ("seed", "u8")])
@@ -147,7 +150,7 @@ class Conditions:
     def without_inertia(self) -> Conditions:
         """These conditions for a world without inertia: what only inertia gives a meaning to is as usual."""
         usual = Conditions().ranges()
-        return self.with_ranges({row.name: usual[row.name] for row in CONDITIONS if row.needs_inertia})
+        return self.with_ranges({name: usual[name] for name in INERTIA_ALONE})
 
     def with_ranges(self, ranges: Mapping[str, Range]) -> Conditions:
         """These conditions with some ranges replaced.

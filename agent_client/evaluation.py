@@ -14,6 +14,7 @@ from agent_client.conditions import Conditions, draw_conditions
 from agent_client.controllers import Controller
 from agent_client.flight import fly
 from agent_client.settings import Settings
+from agent_client.start import RegisterWalls
 from agent_client.task import Outcome
 from agent_client.tubes import PAPER_TUBES, Domain, TubeRecipe, draw_tube
 from meshes.curves import DOMAINS
@@ -25,9 +26,6 @@ from protocol.plant import NO_TUBE
 
 MakeController = Callable[[Geometry], Controller]
 """Makes who flies, given the tubes."""
-
-RegisterWalls = Callable[[AgentSession, Sequence[SweptTube]], Sequence[int]]
-"""Makes the walls of tubes known to the plant of a session; returns the index of each."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,7 @@ class EpisodeResult:
     contacts: int
     """Control steps with contact."""
     length_ratio: float
-    """Steps over length / (v_max dt), the fewest possible."""
+    """Steps over length / (v_max dt); below 1 where corners are cut."""
     conditions: dict[str, float]
     """What the episode drew of those conditions that are ranges (`agent_client.conditions`)."""
 

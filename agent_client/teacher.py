@@ -37,7 +37,8 @@ GRAVITY: Final = 9.81
 
 @dataclass(frozen=True)
 class TeacherOptions:
-    """How the teacher flies; found on tubes of the tuning domain under the hard conditions."""
+    """How the teacher flies under hard conditions: look-ahead and lead found on tubes of the tuning domain, the rest
+    by how policies that imitate it flew other tubes than the README's tables are of."""
 
     lookahead: float = 0.7
     """Arc length ahead (m)."""

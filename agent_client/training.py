@@ -13,10 +13,9 @@ import platform
 import time
 import warnings
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 import numpy as np
 import stable_baselines3
@@ -41,13 +40,11 @@ from agent_client.training_log import EpisodeMeans, Progress, append_log, cut_lo
 from agent_client.training_options import IMITATED, Hyperparameters, TrainingOptions, fitting_minibatch
 from agent_client.training_state import TrainingState, comparable, read_state, write_state
 from agent_client.tubes import LEVELS, draw_pool
-from agent_client.world import TubeWorld
-from protocol.agent import AgentSession, SessionSettings
+from agent_client.world import OpenSession, TubeWorld
+from protocol.agent import SessionSettings
 from protocol.twin import open_twin
 
 __all__ = ["Hyperparameters", "OpenSession", "Progress", "TrainingOptions", "log_path", "state_path", "train"]
-
-OpenSession: TypeAlias = Callable[[SessionSettings], AbstractContextManager[AgentSession]]
 
 
 def state_path(checkpoint: Path) -> Path:

@@ -16,17 +16,17 @@ from agent_client.controllers import PurePursuit
 from agent_client.evaluation import (
     EpisodeResult,
     MakeController,
-    RegisterWalls,
     Score,
     draw_episodes,
     fly_episodes,
     summarise,
 )
 from agent_client.settings import Settings
+from agent_client.start import RegisterWalls
 from agent_client.tubes import PAPER_TUBES, TubeRecipe
 from protocol.agent import AgentSession
 
-OpenSession = Callable[[int], AgentSession]
+OpenLanes = Callable[[int], AgentSession]
 """Opens a session of so many lanes with the plant that is tuned for."""
 
 LOOKAHEADS: Final = (0.15, 0.2, 0.3, 0.45, 0.7, 1.0, 1.5, 2.0, 3.0)
@@ -68,7 +68,7 @@ class Tuning:
 
 
 def tune_pure_pursuit(
-    open_session: OpenSession,
+    open_session: OpenLanes,
     level: int,
     conditions: Conditions,
     recipe: TubeRecipe = PAPER_TUBES,

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import click
 
-from agent_client.conditions import CONDITIONS, Conditions
+from agent_client.conditions import INERTIA_ALONE, Conditions
 from agent_client.settings import Settings
 from agent_client.tubes import TubeRecipe
 from agent_client.tuning import TUNING_EPISODES
@@ -39,9 +39,6 @@ from cosim.workers import Engine
 
 POLICIES: Final = (PURE_PURSUIT, TUNED_PURSUIT, LIDAR_RULE, SHIPPED_POLICY)
 """Who flies when nobody is named."""
-
-INERTIA_ALONE: Final = tuple(row.name for row in CONDITIONS if row.needs_inertia)
-"""Conditions without a meaning in the kinematic world."""
 
 
 @dataclass(frozen=True)
@@ -156,8 +153,7 @@ def make_plan(options: EvaluateOptions) -> Plan:
     if engine == "kinematic":
         _refuse_without_inertia(options.settings.conditions)
         left_out = {name: span for name, span in conditions.changed().items() if name in INERTIA_ALONE}
-        usual = Conditions().ranges()
-        conditions = conditions.with_ranges({name: usual[name] for name in left_out})
+        conditions = conditions.without_inertia()
     variants = [Variant({}, conditions, recipe)]
     if options.grid is not None:
         if options.sweep is not None:

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
+from agent_client.conditions import INERTIA_ALONE
 from agent_client.evaluation import EpisodeResult, summarise, wilson
-from cosim.evaluation_plan import INERTIA_ALONE, EvaluateOptions, Plan, Variant
+from cosim.evaluation_plan import EvaluateOptions, Plan, Variant
 from cosim.named_settings import arguments_of, write_value
 from cosim.pilots import PURE_PURSUIT, TUNED_PURSUIT, Pilot, PilotChoice
 from cosim.versions import versions

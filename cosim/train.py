@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, TextIO
 import click
 
 from agent_client.errors import TrainingOver
+from agent_client.tubes import LEVELS
 from cosim.errors import CosimError, OutputError, Terminated
 from cosim.figures import draw_figures
 from cosim.sessions import server_session
@@ -31,8 +32,6 @@ STATE: Final = "policy.state"
 LOG: Final = "policy.csv"
 ARGUMENTS: Final = "training.json"
 """The arguments of the command, kept for `--resume`."""
-
-LEVELS: Final = 3
 
 
 @dataclass(frozen=True)
