@@ -107,6 +107,10 @@ def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
         )
         plant = session.description
         say(f"physics: {plant.name} {plant.version}, engine {plant.engine}")
+        if not plant.walls:
+            say(
+                "the physics side has no walls: contact is judged from the clearance, and nothing stops the drone"
+            )
         report = _fly_recorded(Flight(options, conduit, pilot, conditions, session, rendezvous, folder))
     if as_json:
         click.echo(json.dumps(report))
@@ -170,6 +174,7 @@ def _fly_recorded(flight: Flight) -> dict[str, Any]:
                 tube=TUBE,
                 parameters=parameters,
                 drawn=drawn,
+                clearance_contact=not session.description.walls,
                 on_contact="end" if options.on_contact == "end" else "continue",
                 step_limit=options.max_steps,
                 on_step=observer,

@@ -57,7 +57,7 @@ class BulletPlant(Plant):
 
     def describe(self) -> PlantDescription:
         """Name the engine and publish the default parameters."""
-        return description(ENGINE)
+        return description(ENGINE, walls=True)
 
     def open(self, lanes: int, dt: float, physics_dt: float, inner_steps: int) -> None:
         """Prepare one empty world a lane.

@@ -33,7 +33,7 @@ class NullPlant(Plant):
 
     def describe(self) -> PlantDescription:
         """Say that nothing integrates here."""
-        return description("null")
+        return description("null", walls=False)
 
     def open(self, lanes: int, dt: float, physics_dt: float, inner_steps: int) -> None:
         """Prepare the poses."""

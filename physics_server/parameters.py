@@ -58,7 +58,7 @@ class BodyParameters:
         return astuple(self)
 
 
-def description(engine: str) -> PlantDescription:
+def description(engine: str, *, walls: bool) -> PlantDescription:
     """What this process publishes of itself with an engine of this name and version."""
     return PlantDescription(
         name="physics_server",
@@ -66,4 +66,5 @@ def description(engine: str) -> PlantDescription:
         engine=engine,
         speed_max=SPEED_MAX,
         defaults=BodyParameters().row(),
+        walls=walls,
     )

@@ -49,7 +49,7 @@ class ReferencePlant(Plant):
 
     def describe(self) -> PlantDescription:
         """Name the engine and publish the default parameters."""
-        return description(ENGINE)
+        return description(ENGINE, walls=False)
 
     def open(self, lanes: int, dt: float, physics_dt: float, inner_steps: int) -> None:
         """Prepare `lanes` bodies, and compile or load the machine code: the first step does not wait for it."""

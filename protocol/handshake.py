@@ -119,6 +119,7 @@ def write_answer(view: memoryview, offer: Offer, answer: Answer) -> None:
     said = answer.description
     _write_common(view, offer, layout.pose_bytes(offer.settings.lanes), answer.pid, answer.started)
     layout.write_f64(view, POSE["speed_max"], said.speed_max)
+    layout.write_i64(view, POSE["walls"], int(said.walls))
     defaults = (*said.defaults, *(0.0,) * (PARAMETER_SLOTS - len(said.defaults)))
     layout.write_f64(view, POSE["defaults"], *defaults)
     layout.write_text(view, POSE["plant_name"], said.name)
@@ -144,12 +145,15 @@ def read_answer(view: memoryview, offer: Offer) -> Answer:
     _demand("speed_max", math.isfinite(speed_max) and speed_max > 0, "a speed > 0 m/s", speed_max)
     defaults = read_f64(view, POSE["defaults"])
     _demand("defaults", all(map(math.isfinite, defaults)), "finite numbers", defaults)
+    walls = read_i64(view, POSE["walls"])
+    _demand("walls", walls in (0, 1), "0 or 1", walls)
     description = PlantDescription(
         name=read_text(view, POSE["plant_name"]),
         version=read_text(view, POSE["plant_version"]),
         engine=read_text(view, POSE["plant_engine"]),
         speed_max=speed_max,
         defaults=defaults[: len(PARAMETERS)],
+        walls=walls == 1,
     )
     return Answer(description, _value(view, "pid"), _value(view, "start_time"))
 

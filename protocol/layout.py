@@ -17,7 +17,7 @@ import numpy as np
 from protocol.plant import COMMAND_WORDS, PARAMETER_SLOTS, POSE_WORDS, RESET_WORDS, Floats
 
 VERSION_MAJOR: Final = 1
-VERSION_MINOR: Final = 0
+VERSION_MINOR: Final = 1
 
 COMMAND_MAGIC: Final = b"TUBE.CMD"
 POSE_MAGIC: Final = b"TUBE.POS"
@@ -99,7 +99,7 @@ class Field:
 HEADER: Final[tuple[Field, ...]] = (
     Field(0, "magic", "bytes", 8, "`TUBE.CMD` or `TUBE.POS`; written last, zero until then"),
     Field(8, "version_major", "i64", 1, "1"),
-    Field(16, "version_minor", "i64", 1, "0"),
+    Field(16, "version_minor", "i64", 1, "1"),
     Field(24, "segment_bytes", "i64", 1, "size of this segment"),
     Field(32, "session", "bytes", 16, "random identity of the session; physics echoes it"),
     Field(48, "pid", "i64", 1, "process id of the writer"),
@@ -146,6 +146,13 @@ COMMAND_SEGMENT: Final[tuple[Field, ...]] = (
 POSE_SEGMENT: Final[tuple[Field, ...]] = (
     *HEADER,
     Field(128, "speed_max", "f64", 1, "largest speed that a command may carry (m/s), > 0"),
+    Field(
+        136,
+        "walls",
+        "i64",
+        1,
+        "1: registered tubes stop the body and contact is reported; 0: not so or not said",
+    ),
     Field(256, "defaults", "f64", PARAMETER_SLOTS, "the plant's default parameters, reserved words zero"),
     Field(512, "plant_name", "bytes", 128, "implementation, UTF-8"),
     Field(640, "plant_version", "bytes", 128, "its version, UTF-8"),

@@ -199,6 +199,8 @@ class PlantDescription:
     """Largest speed that a command may carry (m/s)."""
     defaults: tuple[float, ...]
     """Default plant parameters, in the order of PARAMETERS."""
+    walls: bool = False
+    """Whether registered tubes stop the body and contact with them is reported."""
 
 
 class Plant(ABC):

@@ -116,6 +116,7 @@ WRONG_ANSWERS: list[tuple[str, int | float | bytes]] = [
     ("reset_stride", 1),
     ("speed_max", 0.0),
     ("speed_max", math.nan),
+    ("walls", 2),
 ]
 
 
@@ -156,10 +157,10 @@ def test_a_refused_handshake_is_told_to_the_other_side() -> None:
 
 def test_a_description_survives_the_header() -> None:
     """Names with any characters arrive as they were, cut only where they do not fit."""
-    said = PlantDescription("ünity", "2022.3 β", "x" * 200, 2.5, tuple(float(i) for i in range(18)))
+    said = PlantDescription("ünity", "2022.3 β", "x" * 200, 2.5, tuple(float(i) for i in range(18)), True)
     pair = Pair()
     offer = read_offer(pair.command)
     write_answer(pair.pose, offer, Answer(said, 11, 12))
     found = read_answer(pair.pose, offer)
     assert (found.pid, found.started) == (11, 12)
-    assert found.description == PlantDescription("ünity", "2022.3 β", "x" * 128, 2.5, said.defaults)
+    assert found.description == PlantDescription("ünity", "2022.3 β", "x" * 128, 2.5, said.defaults, True)
