@@ -386,5 +386,3 @@ def _await_header(pose: memoryview, rendezvous: str, watch: Watch | None, timeou
                 "attach",
             )
         time.sleep(LOOK_AGAIN_S / 5)
-    if FENCE is not None:
-        FENCE()

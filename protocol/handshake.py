@@ -159,8 +159,11 @@ def read_answer(view: memoryview, offer: Offer) -> Answer:
 
 
 def magic(view: memoryview) -> bytes:
-    """Return the segment's magic, zero bytes until its writer has finished the header."""
-    return bytes(view[_HEAD["magic"].bytes])
+    """Return the segment's magic, zero bytes until its writer has finished the header; what is read next is newer."""
+    word = bytes(view[_HEAD["magic"].bytes])
+    if FENCE is not None:
+        FENCE()
+    return word
 
 
 def owner(view: memoryview) -> tuple[int, int]:
@@ -181,6 +184,8 @@ def write_farewell(view: memoryview, reason: Farewell, text: str) -> None:
 def read_farewell(view: memoryview) -> tuple[int, str]:
     """Return why a segment's writer left, and what it says; (0, "") while it is there."""
     reason = read_i64(view, COMMAND["farewell"])
+    if reason and FENCE is not None:
+        FENCE()
     return (reason, read_text(view, COMMAND["farewell_text"])) if reason else (0, "")
 
 

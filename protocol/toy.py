@@ -61,11 +61,20 @@ class ToyPlant(Plant):
             poses.sim_time[lane], poses.contact_steps[lane], poses.step[lane] = 0.0, 0, 0
 
     def step(self, commands: CommandBatch, poses: PoseBatch) -> None:
-        """Integrate every lane over one control step."""
+        """Integrate every lane over one control step.
+
+        Raises:
+            FloatingPointError: a state is no longer finite.
+        """
         for lane, parameters in enumerate(self._parameters):
             command, state = commands.raw[lane].tolist(), poses.raw[lane, :13].tolist()
             for _ in range(self._inner_steps):
                 state = inner_step(state, command, parameters, self._physics_dt)
+            if not all(map(math.isfinite, state)):
+                raise FloatingPointError(
+                    f"lane {lane}, control step {int(poses.step[lane]) + 1}: expected a finite state, "
+                    f"found {state}; are the parameters too stiff for inner steps of {self._physics_dt:g} s?"
+                )
             poses.raw[lane, :13] = state
             poses.step[lane] += 1
             poses.sim_time[lane] = poses.step[lane] * self._dt

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from protocol.agent import AgentSession, SessionSettings
-from protocol.errors import Refusal
+from protocol.errors import PeerLost, Refusal, Verdict
 from protocol.plant import CommandBatch, ResetBatch
 from protocol.toy import ToyPlant
 from protocol.twin import open_twin
@@ -99,3 +99,15 @@ def test_it_has_no_gusts(session: AgentSession, resets: Resets) -> None:
     """What the toy cannot do it refuses."""
     with pytest.raises(Refusal, match="gust in lane 0"):
         session.reset(resets(gust=1.0))
+
+
+def test_a_state_that_is_no_longer_finite_ends_the_session(
+    session: AgentSession, resets: Resets, commands: Commands
+) -> None:
+    """A body too fast for its words is an error of the plant's, never a pose."""
+    start = resets(force_gain=0.0)
+    start.linear_velocity[:], start.position[:] = 1e308, 1.7e308
+    session.reset(start)
+    with pytest.raises(PeerLost, match="lane 0, control step 1: expected a finite state") as caught:
+        session.step(commands())
+    assert caught.value.verdict is Verdict.FAILED
