@@ -1,0 +1,152 @@
+"""Sessions brought to one state of the protocol with the server held there, so that a fault falls exactly into it.
+
+A server answers too quickly to be caught at work: it is stopped (SIGSTOP) before the doorbell rings, the fault is
+made, and it goes on (SIGCONT) to find both. The agent is a stand-in process, so that it can die alone.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from protocol.conformance.raw_agent import RawAgent
+from protocol.conformance.rig import PeerProcess, Rig, segments_left
+from protocol.conformance.rule import Failure, demand, expect
+from protocol.conformance.samples import level_commands, resting_resets
+from protocol.conformance.stand_in import StandIn
+from protocol.handshake import owner
+from protocol.layout import FAREWELL, Op
+from protocol.liveness import Life, life
+from protocol.states import TRANSITIONS, TURN, Event, Side, State
+
+NOTICE_S: Final = 0.1
+"""Within this time a side notices that the other is dead (section 10)."""
+ALLOWANCE_S: Final = 0.4
+"""What a busy machine may add to it."""
+SETTLE_S: Final = 0.15
+"""How long nothing may happen where nothing should."""
+
+FAULT_STATES: Final = [state for state, moves in TRANSITIONS.items() if Event.LOSS in moves]
+"""The states in which a side can be lost."""
+UNDER_WAY: Final = {
+    state: Op(event)
+    for event, state in TRANSITIONS[State.READY].items()
+    if TURN[state] is Side.PHYSICS and event in tuple(Op)
+}
+"""The states in which a request is under way, with its op."""
+
+
+@dataclass
+class Scene:
+    """One session in one state."""
+
+    state: State
+    agent: RawAgent
+    server: PeerProcess
+    stand_in: StandIn
+    held: bool = True
+
+    @property
+    def where(self) -> str:
+        """The state in words, for messages."""
+        return f"in state {self.state.name}"
+
+    def go_on(self) -> float:
+        """Let the server go on, and return the time at which it did."""
+        self.held = False
+        now = time.monotonic()
+        self.server.signal(signal.SIGCONT)
+        return now
+
+
+@contextmanager
+def scene(rig: Rig, state: State) -> Iterator[Scene]:
+    """Start a server and bring a session with it into `state`, the server stopped; everything is ended behind it."""
+    if state is State.OFFERED:
+        server = rig.start(rendezvous := rig.new_rendezvous())
+        stop(server, server.pid)
+        agent = rig.agent(rendezvous=rendezvous)
+        stand_in = hand_over(agent)
+        agent.offer(pid=stand_in.pid, start_time=stand_in.started)
+        agent.attend(server)
+    else:
+        agent, server, stand_in = ready(rig)
+        stop(server, *owner(agent.pose))
+        if state is not State.READY:
+            ring(agent, UNDER_WAY[state])
+    try:
+        yield Scene(state, agent, server, stand_in)
+    finally:
+        server.end()
+        stand_in.close()
+        agent.close()
+
+
+def ready(rig: Rig, lanes: int = 1) -> tuple[RawAgent, PeerProcess, StandIn]:
+    """Open a session whose agent is a stand-in, with its lanes reset and a step done."""
+    agent = rig.agent(lanes, rendezvous=rig.new_rendezvous())
+    stand_in = hand_over(agent)
+    agent.offer(pid=stand_in.pid, start_time=stand_in.started)
+    server = rig.start(agent.rendezvous)
+    agent.attend(server)
+    agent.await_header()
+    expect("status of a reset", agent.reset(resting_resets(agent)).status, 0)
+    expect("status of a step", agent.step(level_commands(lanes)).status, 0)
+    return agent, server, stand_in
+
+
+def ring(agent: RawAgent, op: Op, **words: int) -> None:
+    """Publish a sound request of any kind, its payload in place, or one with other `words`."""
+    if op is Op.STEP:
+        agent.put_commands(level_commands(agent.settings.lanes))
+    elif op is Op.RESET:
+        agent.put_resets(resting_resets(agent))
+    agent.request(op, **words)
+
+
+def hand_over(agent: RawAgent) -> StandIn:
+    """Let a stand-in hold the lock of the command segment in place of the kit."""
+    path = command_path(agent.rendezvous)
+    os.close(os.open(path, os.O_RDWR))  # POSIX gives up all record locks of a file that a process closes once
+    return StandIn(path)
+
+
+def command_path(rendezvous: str) -> Path:
+    """The file of a command segment."""
+    (path,) = (Path(name) for name in segments_left(rendezvous) if name.endswith(".cmd"))
+    return path
+
+
+def stop(server: PeerProcess, pid: int, started: int = 0) -> None:
+    """Stop a server and wait until it stands still.
+
+    Raises:
+        Failure: it does not.
+    """
+    server.signal(signal.SIGSTOP)
+    until = time.monotonic() + 5.0
+    while life(pid, started) is not Life.STOPPED:
+        if time.monotonic() > until:
+            raise Failure("the server", "a process that SIGSTOP stops", life(pid, started).value)
+        time.sleep(0.001)
+
+
+def noticed(what: str, since: float, holds: bool, bound: float = NOTICE_S) -> float:
+    """Demand that something came to hold within a bound, and return how long it took (s)."""
+    took = time.monotonic() - since
+    demand(holds, what, f"within {bound * 1e3:.0f} ms (and {ALLOWANCE_S * 1e3:.0f} ms allowed)", "not yet")
+    return took
+
+
+def without_farewell(segment: memoryview) -> bytes:
+    """The bytes of a segment, its farewell blanked."""
+    content = bytearray(segment)
+    for field in FAREWELL:
+        content[field.bytes] = bytes(field.size)
+    return bytes(content)
