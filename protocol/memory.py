@@ -30,8 +30,12 @@ POSE_SUFFIX: Final = ".pose"
 
 _log = logging.getLogger("protocol")
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-_SHM_FOLDER: Final = Path("/dev/shm")
+SHM_FOLDER: Final = Path("/dev/shm")
+"""Where Linux shows shared memory as files."""
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+_claims: set[tuple[int, int, int]] = set()
+"""Process, device and inode of every file that `Segment.lock` claimed; a process forked from ours has no claim."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +62,8 @@ def parse_rendezvous(text: str) -> Rendezvous:
                 "rendezvous: expected shm:NAME with 1 to 64 letters, digits, dots, dashes or underscores, "
                 f"the first a letter or digit, found {text!r}"
             )
-        if sys.platform != "win32" and not _SHM_FOLDER.is_dir():
-            raise SessionError(f"rendezvous {text!r}: this system has no {_SHM_FOLDER}; use file:/path/stem")
+        if sys.platform != "win32" and not SHM_FOLDER.is_dir():
+            raise SessionError(f"rendezvous {text!r}: this system has no {SHM_FOLDER}; use file:/path/stem")
         return Rendezvous(kind, stem)
     if kind == "file":
         path = Path(stem)
@@ -84,6 +88,7 @@ class Segment:
         self._descriptor = descriptor
         self._unmap = unmap
         self._lock: SharedMemory | None = None
+        self._claim: tuple[int, int, int] | None = None
 
     def lock(self) -> bool:
         """Claim the segment for its one writer, until this process closes it or dies; False where it is taken.
@@ -99,6 +104,9 @@ class Segment:
             fcntl.lockf(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, 1)
         except (BlockingIOError, PermissionError):  # EAGAIN or EACCES, as the system likes
             return False
+        status = os.fstat(self._descriptor)
+        self._claim = (os.getpid(), status.st_dev, status.st_ino)
+        _claims.add(self._claim)
         return True
 
     if sys.platform == "win32":
@@ -118,7 +126,7 @@ class Segment:
 
     def unlink(self) -> None:
         """Remove the segment's name, unless it is gone already or stands for a newer segment."""
-        if self.path is None:  # Windows removes shared memory with its last user
+        if self.path is None or self._descriptor == _CLOSED:  # Windows removes shared memory with its last user
             return
         try:
             if os.path.samestat(os.fstat(self._descriptor), self.path.stat()):
@@ -139,6 +147,8 @@ class Segment:
         if self._descriptor >= 0:
             os.close(self._descriptor)
         self._descriptor = _CLOSED
+        if self._claim is not None:
+            _claims.discard(self._claim)
 
 
 _NO_DESCRIPTOR: Final = -1
@@ -220,6 +230,21 @@ def open_segment(rendezvous: Rendezvous, suffix: str) -> Segment | None:
         raise SessionError(f"cannot open segment {name}: {error}") from error
 
 
+def is_ours(path: Path) -> bool:
+    """Tell whether this very process holds the lock of the segment that `path` shows."""
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        return False
+    return (os.getpid(), status.st_dev, status.st_ino) in _claims
+
+
+def segment_path(rendezvous: Rendezvous, suffix: str) -> Path:
+    """Return where the file system shows a segment (Windows shows no shared memory)."""
+    folder = SHM_FOLDER if rendezvous.kind == "shm" else Path()
+    return folder / (rendezvous.stem + suffix)
+
+
 def _map_file(name: str, path: Path, descriptor: int, size: int) -> Segment:
     mapping = mmap.mmap(descriptor, size)
     return Segment(name, memoryview(mapping), path, descriptor, mapping.close)
@@ -231,7 +256,7 @@ def _wrap_shared(name: str, shared: SharedMemory) -> Segment:
     view = memoryview(shared.buf)
     if sys.platform == "win32":
         return Segment(name, view, None, _NO_DESCRIPTOR, shared.close)
-    path = _SHM_FOLDER / name
+    path = SHM_FOLDER / name
     try:
         descriptor = os.open(path, os.O_RDWR)
     except BaseException:
@@ -278,7 +303,7 @@ def _reserve(descriptor: int, size: int) -> None:
 def _why_not_created(name: str, rendezvous: Rendezvous, size: int, error: OSError) -> str:
     if error.errno not in _NO_ROOM:
         return f"cannot create segment {name}: {error}"
-    folder = _SHM_FOLDER if rendezvous.kind == "shm" else Path(rendezvous.stem).parent
+    folder = SHM_FOLDER if rendezvous.kind == "shm" else Path(rendezvous.stem).parent
     free = shutil.disk_usage(folder).free if folder.is_dir() else 0
     advice = (
         "enlarge it (docker run --shm-size) or use file:/path/stem"
