@@ -189,9 +189,13 @@ def read_farewell(view: memoryview) -> tuple[int, str]:
     return (reason, read_text(view, COMMAND["farewell_text"])) if reason else (0, "")
 
 
-def part(view: memoryview, error: BaseException) -> None:
-    """Write the farewell that an error of ours, or one that we found in the peer, calls for."""
-    if isinstance(error, PeerLost):
+def part(view: memoryview, error: BaseException, peer: memoryview | None = None) -> None:
+    """Write the farewell that an error of ours, or one that we found in the peer, calls for.
+
+    `peer` is the other side's segment: what only passes on a farewell that stands there is of kind 1.
+    """
+    passes_on = isinstance(error, (SessionError, HandshakeError)) and peer is not None and read_farewell(peer)[0]
+    if passes_on or isinstance(error, PeerLost):
         write_farewell(view, Farewell.STOPPED, f"it gave up: {error}")
     elif isinstance(error, PeerViolation):
         write_farewell(view, Farewell.VIOLATION, str(error))

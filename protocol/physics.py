@@ -79,7 +79,7 @@ def _serve_attached(command: memoryview, pose: memoryview, plant: Plant) -> None
             while session.answer(wait(session.number, session.steps, "idle")):
                 pass
         except BaseException as error:
-            handshake.part(pose, error)
+            handshake.part(pose, error, command)
             raise
 
 
