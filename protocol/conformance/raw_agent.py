@@ -83,7 +83,7 @@ class RawAgent:
         self.words, self._reply = self.command.cast("q"), self.pose.cast("q")
         self.session = os.urandom(16)
 
-    # --- handshake -----------------------------------------------------------------------------------------------
+    # --- handshake ---
 
     def offer(self, **words: Value) -> None:
         """Write the header, its magic last; `words` replace fields of a sound one."""
@@ -140,7 +140,7 @@ class RawAgent:
         if ended is not None and handshake.magic(self.pose) == _NO_MAGIC:
             raise Failure("the server", due, f"its end, {ended}")
 
-    # --- requests ------------------------------------------------------------------------------------------------
+    # --- requests ---
 
     def put(self, **words: Value) -> None:
         """Write fields of the command segment by name: integers, floats, or bytes as they are."""
@@ -236,7 +236,7 @@ class RawAgent:
         rows = np.frombuffer(bytes(self.pose[layout.pose_rows(lanes)]), np.float64)
         return PoseBatch(rows.reshape(lanes, POSE_WORDS).copy())
 
-    # --- sound requests ------------------------------------------------------------------------------------------
+    # --- sound requests ---
 
     def ask(self, op: int, **words: int) -> Reply:
         """Publish a request and wait for its reply, done or refused."""
@@ -257,7 +257,12 @@ class RawAgent:
         """Say goodbye."""
         return self.ask(Op.GOODBYE)
 
-    # --- the end -------------------------------------------------------------------------------------------------
+    def locks_pose(self) -> bool:
+        """Whether the lock on the pose segment, which is the server's, can be had; if so it is held from now on."""
+        assert self._segments is not None
+        return self._segments.pose.lock()
+
+    # --- the end ---
 
     def farewell(self) -> tuple[int, str]:
         """The server's farewell and its text; (0, "") while it has said none."""

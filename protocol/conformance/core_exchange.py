@@ -1,0 +1,348 @@
+"""Core rules of the exchange: numbers and counts, whose turn it is, every transition of a request, the end."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from protocol import handshake, layout
+from protocol.conformance.raw_agent import RawAgent, Reply
+from protocol.conformance.rig import Rig, await_end, segments_left
+from protocol.conformance.rule import Failure, Level, Skip, demand, expect, server_rule
+from protocol.conformance.sound import (
+    commands,
+    done,
+    fly,
+    put_tube,
+    refused,
+    register,
+    release,
+    resets,
+    speed_max,
+    words,
+    write_box,
+)
+from protocol.errors import RefusalCode
+from protocol.layout import COMMAND, POSE, Farewell, Op, Status
+from protocol.states import TRANSITIONS, Event, State
+
+_MOMENT_S: Final = 0.05
+_SILENCE_S: Final = 0.15
+
+
+@server_rule(
+    "reply-numbers", Level.CORE, "5", "a reply carries its request's number in begin, end and doorbell"
+)
+def reply_numbers(rig: Rig) -> None:
+    """From 1 on, whatever is asked, done or refused."""
+    agent = rig.open()
+    agent.put_commands(commands(agent))
+    replies = [
+        agent.ask(Op.STEP),
+        agent.reset(resets(agent)),
+        *(agent.step(commands(agent)) for _ in range(3)),
+    ]
+    replies += [release(agent, 0), agent.goodbye()]
+    for number, reply in enumerate(replies, start=1):
+        expect(
+            f"numbers of reply {number}", (reply.doorbell, reply.begin, reply.end), (number, number, number)
+        )
+
+
+@server_rule("step-count", Level.CORE, "5", "the reply's step counts the control steps of the session")
+def step_count(rig: Rig) -> None:
+    """Steps add one; resets and refusals leave it, over all episodes."""
+    agent = rig.open()
+    counts = []
+    for _ in range(2):
+        counts.append(agent.reset(resets(agent)).step)
+        counts += [agent.step(commands(agent)).step for _ in range(3)]
+        counts.append(release(agent, 0).step)
+    expect("step of each reply", counts, [0, 1, 2, 3, 3, 3, 4, 5, 6, 6])
+
+
+@server_rule(
+    "refused-step-count", Level.CORE, "5", "a refused step leaves the count; the next one carries it again"
+)
+def refused_step_count(rig: Rig) -> None:
+    """The request after a refused step has the same step and is carried out."""
+    agent = rig.open()
+    done(agent.reset(resets(agent)), "a reset")
+    fly(agent, commands(agent), 1)
+    reply = agent.step(commands(agent, speed=2 * speed_max(agent)))
+    refused(reply, "a speed of twice speed_max", RefusalCode.OUT_OF_RANGE, 0)
+    expect("step of the reply to a refused step", reply.step, 1)
+    done(agent.step(commands(agent)), "the same step again, with a sound command")
+    expect("step of the reply", agent.steps, 2)
+
+
+@server_rule(
+    "engine-time", Level.CORE, "5", "engine_ns is no more than the exchange took, and 0 for a refusal"
+)
+def engine_time(rig: Rig) -> None:
+    """The plant's time lies within the agent's."""
+    agent = rig.open()
+    done(agent.reset(resets(agent)), "a reset")
+    for _ in range(5):
+        agent.put_commands(commands(agent))
+        began = time.perf_counter_ns()
+        reply = agent.ask(Op.STEP)
+        whole = time.perf_counter_ns() - began
+        demand(0 <= reply.engine_ns <= whole, "engine_ns of a step", f"0 to {whole}", reply.engine_ns)
+    expect("engine_ns of a refused request", release(agent, 0).engine_ns, 0)
+
+
+@server_rule("silent-between-requests", Level.CORE, "5", "between requests the server writes nothing")
+def silent_between_requests(rig: Rig) -> None:
+    """Nothing integrates without a command: the pose segment stays as it is, byte for byte."""
+    agent = rig.open()
+    done(agent.reset(resets(agent, gravity=9.81)), "a reset")
+    fly(agent, commands(agent, compensation=0.0), 2)
+    before = bytes(agent.pose)
+    time.sleep(_SILENCE_S)
+    _same_bytes("the pose segment while no request is under way", bytes(agent.pose), before)
+
+
+@server_rule("reply-whole-at-doorbell", Level.CORE, "11", "a reply is whole when its doorbell rings")
+def reply_whole_at_doorbell(rig: Rig) -> None:
+    """What stands when the doorbell shows stays as it is, for a step and for a refusal."""
+    agent = rig.open()
+    done(agent.reset(resets(agent, gravity=9.81)), "a reset")
+    for compensation in (0.0, 3.0):  # the second is refused
+        agent.put_commands(commands(agent, compensation=compensation))
+        agent.request(Op.STEP)
+        agent.await_reply()
+        seen = bytes(agent.pose)
+        time.sleep(_MOMENT_S)
+        _same_bytes("the pose segment after the doorbell rang", bytes(agent.pose), seen)
+
+
+@server_rule("command-segment-untouched", Level.CORE, "2", "the server never writes into the agent's segment")
+def command_segment_untouched(rig: Rig) -> None:
+    """Every byte of .cmd is as the agent left it, at the end of a session."""
+    agent = rig.open()
+    agent.reset(resets(agent))
+    fly(agent, commands(agent), 2)
+    register(agent, 0, write_box(rig.folder / "box.obj"))
+    agent.request(Op.GOODBYE)
+    written = bytes(agent.command)
+    agent.await_reply()
+    _same_bytes("the command segment", bytes(agent.command), written)
+
+
+def _same_bytes(what: str, found: bytes, expected: bytes) -> None:
+    for at, (one, other) in enumerate(zip(found, expected, strict=True)):
+        if one != other:
+            raise Failure(f"{what}, byte {at}", f"{other:#04x}", f"{one:#04x}")
+
+
+# --- transitions ---
+
+
+def _step(agent: RawAgent, folder: Path) -> Reply:
+    return agent.step(commands(agent))
+
+
+def _reset(agent: RawAgent, folder: Path) -> Reply:
+    return agent.reset(resets(agent))
+
+
+def _register(agent: RawAgent, folder: Path) -> Reply:
+    return register(agent, 0, write_box(folder / "box.obj"))
+
+
+def _release(agent: RawAgent, folder: Path) -> Reply:
+    return release(agent, 0)
+
+
+def _walk(
+    event: Event, ask: Callable[[RawAgent, Path], Reply], *before: Callable[[RawAgent, Path], Reply]
+) -> None:
+    """Register the rule that a request is done, that its unsound form is refused, and that both lead to READY."""
+    busy = TRANSITIONS[State.READY][event]
+    name = event.name.lower()
+
+    @server_rule(
+        f"transition-{name.replace('_', '-')}",
+        Level.CORE,
+        "9",
+        f"READY, {event.name}: {busy.name}; DONE or REFUSED: READY again",
+        covers=((State.READY, event), (busy, Event.DONE), (busy, Event.REFUSED)),
+    )
+    def transition(rig: Rig) -> None:
+        agent = rig.open()
+        for earlier in before:
+            _carried_out(earlier(agent, rig.folder), "a request before it")
+        _carried_out(ask(agent, rig.folder), name)
+        _SPOIL[event](agent)
+        reply = agent.ask(int(event))
+        demand(reply.refused is not None, f"an unsound {name}", "a refusal", "status 0")
+        _carried_out(agent.reset(resets(agent)), "a reset after it")
+
+    transition.__doc__ = (
+        f"The server carries out {name}, refuses an unsound one, and takes requests after both."
+    )
+
+
+def _carried_out(reply: Reply, what: str) -> None:
+    if reply.refused is not None and reply.refused.code == RefusalCode.PLANT and "reset" not in what:
+        raise Skip(f"the plant refuses this ({words(reply.refused)})")
+    done(reply, what)
+
+
+def _spoil_commands(agent: RawAgent) -> None:
+    agent.put_commands(commands(agent, compensation=3.0))
+
+
+def _spoil_resets(agent: RawAgent) -> None:
+    agent.put_resets(resets(agent, mass=-1.0))
+
+
+def _spoil_index(agent: RawAgent) -> None:
+    agent.put(tube_index=-1)
+
+
+_SPOIL: Final[dict[Event, Callable[[RawAgent], None]]] = {
+    Event.STEP: _spoil_commands,
+    Event.RESET: _spoil_resets,
+    Event.REGISTER_TUBE: _spoil_index,
+    Event.RELEASE_TUBE: _spoil_index,
+}
+
+_walk(Event.STEP, _step, _reset)
+_walk(Event.RESET, _reset)
+_walk(Event.REGISTER_TUBE, _register)
+_walk(Event.RELEASE_TUBE, _release, _register)
+
+
+@server_rule(
+    "goodbye",
+    Level.CORE,
+    "6",
+    "a goodbye is answered with status 0, and the server leaves",
+    covers=((State.READY, Event.GOODBYE), (State.CLOSING, Event.DONE)),
+)
+def goodbye(rig: Rig) -> None:
+    """The answer comes first; the process ends within 5 s; the segments stay for the agent to remove."""
+    agent = rig.open()
+    fly_a_little(agent)
+    expect("status of the reply to goodbye", agent.goodbye().status, Status.DONE.value)
+    assert agent.process is not None
+    await_end(agent.process, "after the goodbye")
+    expect("farewell after a goodbye", agent.farewell()[0], int(Farewell.NONE))
+    expect("segments after a goodbye", len(segments_left(agent.rendezvous)), 2)
+
+
+def fly_a_little(agent: RawAgent) -> None:
+    """A reset and two steps."""
+    done(agent.reset(resets(agent)), "a reset")
+    fly(agent, commands(agent), 2)
+
+
+@server_rule(
+    "agent-farewell-idle",
+    Level.CORE,
+    "8",
+    "the agent's farewell between requests ends the server",
+    covers=((State.READY, Event.FAREWELL),),
+)
+def agent_farewell_idle(rig: Rig) -> None:
+    """The server unmaps the segments, removes nothing, and leaves."""
+    agent = rig.open()
+    fly_a_little(agent)
+    _leave(agent)
+    _ends_with_segments(agent)
+
+
+def _leave(agent: RawAgent) -> None:
+    handshake.write_farewell(agent.command, Farewell.STOPPED, "it was told to stop")
+
+
+def _ends_with_segments(agent: RawAgent) -> None:
+    assert agent.process is not None
+    await_end(agent.process, "after the agent's farewell")
+    expect("segments of a living agent that said farewell", len(segments_left(agent.rendezvous)), 2)
+
+
+def _leave_while(event: Event) -> None:
+    """Register the rule that the agent's farewell right behind a request ends the server."""
+    busy = TRANSITIONS[State.READY][event]
+
+    @server_rule(
+        f"agent-farewell-{busy.name.lower()}",
+        Level.CORE,
+        "8",
+        f"the agent's farewell in state {busy.name} ends the server",
+        covers=((busy, Event.FAREWELL),),
+    )
+    def farewell(rig: Rig) -> None:
+        agent = rig.open()
+        fly_a_little(agent)
+        agent.put_commands(commands(agent))
+        put_tube(agent, 0, write_box(rig.folder / "box.obj"))
+        agent.request(int(event))
+        _leave(agent)
+        _ends_with_segments(agent)
+        rung = agent.reply().doorbell
+        if rung == agent.number:
+            reply = agent.await_reply()
+            demand(reply.status in tuple(Status), "status of the last reply", "0 or 1", reply.status)
+
+    farewell.__doc__ = f"The server may answer {event.name.lower()} first, with a reply that is whole."
+
+
+for _event in (Event.STEP, Event.RESET, Event.REGISTER_TUBE, Event.RELEASE_TUBE, Event.GOODBYE):
+    _leave_while(_event)
+
+
+@server_rule(
+    "second-client", Level.CORE, "2", "a second server at the same session leaves without writing a byte"
+)
+def second_client(rig: Rig) -> None:
+    """It finds the lock taken; the first one is not disturbed."""
+    agent = rig.open()
+    fly_a_little(agent)
+    before = bytes(agent.pose)
+    await_end(rig.start(), "since another server holds the session")
+    _same_bytes("the pose segment after a second server came", bytes(agent.pose), before)
+    expect("segments of a served session", len(segments_left(agent.rendezvous)), 2)
+    fly(agent, commands(agent), 1)
+
+
+@server_rule("served-once", Level.CORE, "2", "a session that was served is not served again")
+def served_once(rig: Rig) -> None:
+    """After the first server's orderly end another one leaves without writing a byte."""
+    agent = rig.open()
+    done(agent.goodbye(), "goodbye")
+    assert agent.process is not None
+    await_end(agent.process, "after the goodbye")
+    before = bytes(agent.pose)
+    await_end(rig.start(), "since the session was served", rig.timeout)
+    _same_bytes("the pose segment after another server came", bytes(agent.pose), before)
+
+
+@server_rule(
+    "first-server-died", Level.CORE, "2", "a server that died before its magic did not serve: another may"
+)
+def first_server_died(rig: Rig) -> None:
+    """A pose segment with a pid, and neither magic nor farewell, is taken over."""
+    agent = rig.agent()
+    layout.write_i64(agent.pose, POSE["pid"], 2**22 + 1)  # beyond the pids of Linux: no such process
+    agent.offer()
+    agent.attend(rig.start())
+    agent.await_header()
+    fly_a_little(agent)
+
+
+@server_rule("payload-words-left", Level.CORE, "6", "words that a request does not use are not looked at")
+def payload_words_left(rig: Rig) -> None:
+    """A step between nonsense in the reset rows and the tube's words is a step."""
+    agent = rig.open()
+    done(agent.reset(resets(agent)), "a reset")
+    rows = layout.reset_rows(1)
+    agent.command[rows] = b"\xff" * (rows.stop - rows.start)
+    start, end = COMMAND["tube_index"].offset, COMMAND["tube_path"].offset
+    agent.command[start:end] = b"\xff" * (end - start)
+    fly(agent, commands(agent), 1)
