@@ -17,8 +17,8 @@ from typing import Final
 
 from protocol.conformance.raw_agent import RawAgent
 from protocol.conformance.rig import PeerProcess, Rig, segments_left
-from protocol.conformance.rule import Failure, demand, expect
-from protocol.conformance.samples import level_commands, resting_resets
+from protocol.conformance.rule import Failure, expect
+from protocol.conformance.sound import commands, resets
 from protocol.conformance.stand_in import StandIn
 from protocol.handshake import owner
 from protocol.layout import FAREWELL, Op
@@ -96,17 +96,17 @@ def ready(rig: Rig, lanes: int = 1) -> tuple[RawAgent, PeerProcess, StandIn]:
     server = rig.start(agent.rendezvous)
     agent.attend(server)
     agent.await_header()
-    expect("status of a reset", agent.reset(resting_resets(agent)).status, 0)
-    expect("status of a step", agent.step(level_commands(lanes)).status, 0)
+    expect("status of a reset", agent.reset(resets(agent)).status, 0)
+    expect("status of a step", agent.step(commands(agent)).status, 0)
     return agent, server, stand_in
 
 
 def ring(agent: RawAgent, op: Op, **words: int) -> None:
     """Publish a sound request of any kind, its payload in place, or one with other `words`."""
     if op is Op.STEP:
-        agent.put_commands(level_commands(agent.settings.lanes))
+        agent.put_commands(commands(agent))
     elif op is Op.RESET:
-        agent.put_resets(resting_resets(agent))
+        agent.put_resets(resets(agent))
     agent.request(op, **words)
 
 
@@ -135,13 +135,6 @@ def stop(server: PeerProcess, pid: int, started: int = 0) -> None:
         if time.monotonic() > until:
             raise Failure("the server", "a process that SIGSTOP stops", life(pid, started).value)
         time.sleep(0.001)
-
-
-def noticed(what: str, since: float, holds: bool, bound: float = NOTICE_S) -> float:
-    """Demand that something came to hold within a bound, and return how long it took (s)."""
-    took = time.monotonic() - since
-    demand(holds, what, f"within {bound * 1e3:.0f} ms (and {ALLOWANCE_S * 1e3:.0f} ms allowed)", "not yet")
-    return took
 
 
 def without_farewell(segment: memoryview) -> bytes:

@@ -1,0 +1,404 @@
+"""Rules for servers about an agent that dies, leaves, stands still or was here before; in every state.
+
+The states come from the table of states, so that none is forgotten: `scenes.FAULT_STATES`.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from typing import Final
+
+from protocol.conformance.raw_agent import RawAgent
+from protocol.conformance.rig import (
+    LEAVING_S,
+    PeerProcess,
+    Rig,
+    await_end,
+    await_no_segments,
+    segments_left,
+)
+from protocol.conformance.rule import Failure, Level, Skip, demand, expect, server_rule
+from protocol.conformance.scenes import (
+    ALLOWANCE_S,
+    FAULT_STATES,
+    NOTICE_S,
+    SETTLE_S,
+    UNDER_WAY,
+    Scene,
+    command_path,
+    hand_over,
+    ready,
+    ring,
+    scene,
+    stop,
+)
+from protocol.conformance.sound import commands, resets
+from protocol.conformance.stand_in import StandIn
+from protocol.handshake import owner, write_farewell
+from protocol.layout import COMMAND, Farewell, read_i64
+from protocol.states import Event, State
+
+ROBUSTNESS: Final = Level.ROBUSTNESS
+PAUSE_S: Final = 0.3
+LONG_PAUSE_S: Final = 1.0
+_BOUND: Final = NOTICE_S + ALLOWANCE_S
+_KINDS: Final = (Farewell.STOPPED, Farewell.FAILED, Farewell.VIOLATION, Farewell.HANDSHAKE)
+
+
+def _covers(event: Event) -> tuple[tuple[State, Event], ...]:
+    return tuple((state, event) for state in FAULT_STATES)
+
+
+# --- death ---
+
+
+@server_rule(
+    "agent-killed",
+    ROBUSTNESS,
+    "10",
+    f"an agent killed in any state is noticed within 100 ms (+{ALLOWANCE_S * 1e3:.0f}): names removed, server ends",
+    covers=_covers(Event.LOSS),
+)
+def _agent_killed(rig: Rig) -> str:
+    took = {state: _dies(rig, state, StandIn.kill) for state in FAULT_STATES}
+    return _slowest(took)
+
+
+@server_rule(
+    "agent-exits",
+    ROBUSTNESS,
+    "10",
+    "an agent that exits without goodbye or farewell is noticed as one that was killed is",
+)
+def _agent_exits(rig: Rig) -> str:
+    return _slowest({state: _dies(rig, state, StandIn.leave) for state in (State.READY, State.STEPPING)})
+
+
+@server_rule("agent-zombie", ROBUSTNESS, "10", "an agent that is a zombie is dead")
+def _agent_zombie(rig: Rig) -> str:
+    return _slowest({State.READY: _dies(rig, State.READY, lambda stand_in: stand_in.kill(reap=False))})
+
+
+def _slowest(took: dict[State, float]) -> str:
+    state = max((s for s in took if s is not State.OFFERED), key=lambda s: took[s])
+    return f"noticed after {took[state] * 1e3:.0f} ms at most ({state.name})"
+
+
+def _dies(rig: Rig, state: State, how: object) -> float:
+    """Let the agent die in a state; return how long the names stood after that (s)."""
+    assert callable(how)
+    with scene(rig, state) as s:
+        how(s.stand_in)
+        since = s.go_on()
+        # A server that is still starting looks at its first session whenever it has started.
+        bound = rig.timeout if state is State.OFFERED else _BOUND
+        _await_removal(s, bound)
+        took = time.monotonic() - since
+        if state is not State.OFFERED:  # there it waits on, for a new agent
+            await_end(s.server, f"after its agent died {s.where}")
+        return took
+
+
+def _await_removal(s: Scene, bound: float) -> None:
+    try:
+        await_no_segments(s.agent.rendezvous, bound)
+    except Failure as failure:
+        raise Failure(f"segments of an agent that died {s.where}", failure.expected, failure.found) from None
+
+
+@server_rule(
+    "agent-pid-reused", ROBUSTNESS, "10", "a process of the agent's pid but another start is not the agent"
+)
+def _agent_pid_reused(rig: Rig) -> None:
+    agent = rig.agent()
+    stand_in = hand_over(agent)
+    try:
+        if not stand_in.started:
+            raise Skip("the start of a process is not known on this system")
+        agent.offer(pid=stand_in.pid, start_time=stand_in.started - 1)
+        stand_in.close()  # its lock is given up: who held it is dead, and the pid is another's
+        other = StandIn()
+        try:
+            agent.put(pid=other.pid, start_time=other.started - 1)
+            rig.start()
+            await_no_segments(rig.rendezvous, rig.timeout)
+        finally:
+            other.close()
+    finally:
+        stand_in.close()
+
+
+@server_rule(
+    "newer-segments-kept",
+    ROBUSTNESS,
+    "2",
+    "a server whose agent died does not remove the segments of a newer session",
+)
+def _newer_segments_kept(rig: Rig) -> None:
+    with scene(rig, State.READY) as s:
+        path = command_path(s.agent.rendezvous)
+        names = (path, path.with_suffix(".pose"))
+        for name in names:
+            name.unlink()
+            name.write_bytes(b"another session's")
+        s.stand_in.kill()
+        s.go_on()
+        await_end(s.server, "after its agent died")
+        for name in names:
+            demand(name.exists(), name.suffix, "the newer segment of that name kept", "it was removed")
+            name.unlink()
+
+
+# --- silence ---
+
+
+@server_rule(
+    "agent-paused",
+    ROBUSTNESS,
+    "10",
+    "an agent that stands still (SIGSTOP), in any state and for a second, is waited for and then answered",
+)
+def _agent_paused(rig: Rig) -> None:
+    agent = rig.agent()
+    stand_in = hand_over(agent)
+    try:
+        agent.offer(pid=stand_in.pid, start_time=stand_in.started)
+        stand_in.stop()
+        server = rig.start()
+        agent.attend(server)
+        agent.await_header()
+        _still_there(server, agent, LONG_PAUSE_S, State.OFFERED)
+        stand_in.resume()
+        expect("status of a reset", agent.reset(resets(agent)).status, 0)
+        for state, op in UNDER_WAY.items():
+            stand_in.stop()
+            ring(agent, op)
+            agent.await_reply()
+            if state is not State.CLOSING:
+                _still_there(server, agent, PAUSE_S, state)
+            stand_in.resume()
+        await_end(server, "after a goodbye")
+    finally:
+        stand_in.close()
+
+
+def _still_there(server: PeerProcess, agent: RawAgent, seconds: float, state: State) -> None:
+    before = bytes(agent.pose)
+    time.sleep(seconds)
+    expect(f"the end of a server whose agent stands still after {state.name}", server.watch(), None)
+    demand(
+        bytes(agent.pose) == before,
+        "the pose segment",
+        "untouched while no request is under way",
+        "it changed",
+    )
+
+
+@server_rule(
+    "server-paused",
+    ROBUSTNESS,
+    "10",
+    "a server that was stopped and continued, in any state, answers what was asked meanwhile, exactly once",
+)
+def _server_paused(rig: Rig) -> None:
+    with scene(rig, State.OFFERED) as s:
+        time.sleep(PAUSE_S)
+        s.go_on()
+        s.agent.await_header()
+    agent, server, stand_in = ready(rig)
+    try:
+        for state, op in UNDER_WAY.items():
+            stop(server, *owner(agent.pose))
+            ring(agent, op)
+            time.sleep(PAUSE_S)
+            expect(f"replies of a stopped server {state.name}", agent.get("doorbell"), agent.number - 1)
+            server.signal(signal.SIGCONT)
+            agent.await_reply()
+            if state is not State.CLOSING:
+                _still_there(server, agent, SETTLE_S, state)
+        await_end(server, "after a goodbye")
+        expect("the server's last doorbell", agent.get("doorbell"), agent.number)
+    finally:
+        stand_in.close()
+
+
+# --- farewells ---
+
+
+@server_rule(
+    "agent-farewell",
+    ROBUSTNESS,
+    "8",
+    f"an agent's farewell, of any kind and in any state, ends the server within 100 ms (+{ALLOWANCE_S * 1e3:.0f}) "
+    "and the names stay",
+    covers=tuple((state, Event.FAREWELL) for state in FAULT_STATES if state is not State.OFFERED),
+)
+def _agent_farewell(rig: Rig) -> str:
+    took = {}
+    for number, state in enumerate((*UNDER_WAY, *(State.READY,) * len(_KINDS))):
+        kind = _KINDS[number % len(_KINDS)]
+        with scene(rig, state) as s:
+            write_farewell(s.agent.command, kind, "it is a test of farewells")
+            since = s.go_on()
+            _await_leaving(s, since)
+            took[state] = time.monotonic() - since
+            await_end(s.server, f"after the agent's farewell {kind.value} {s.where}")
+            demand(
+                len(segments_left(s.agent.rendezvous)) == 2,
+                f"segments of a living agent that left {s.where}",
+                "both kept: the agent removes them",
+                segments_left(s.agent.rendezvous),
+            )
+            said, _ = s.agent.farewell()
+            demand(said in (0, 1), "the server's own farewell", "none, or kind 1", said)
+    return f"ended after {max(took.values()) * 1e3:.0f} ms at most"
+
+
+def _await_leaving(s: Scene, since: float) -> None:
+    """Wait until a server has left: by a farewell of its own, or by its end."""
+    while not s.agent.farewell()[0] and s.server.watch() is None:
+        if s.state is State.CLOSING and s.agent.get("doorbell") == s.agent.number:
+            return  # it answers the goodbye and leaves by that
+        if time.monotonic() - since > _BOUND + LEAVING_S / 10:
+            raise Failure(
+                f"a server whose agent said farewell {s.where}",
+                f"a farewell of its own or its end within {_BOUND * 1e3:.0f} ms",
+                "neither",
+            )
+        time.sleep(0.001)
+
+
+# --- what was here before ---
+
+
+def _serves_next(rig: Rig, rendezvous: str, server: PeerProcess) -> None:
+    """Demand that a waiting server takes the next session at its rendezvous."""
+    agent = rig.agent(rendezvous=rendezvous)
+    agent.offer()
+    agent.attend(server)
+    agent.await_header()
+    agent.goodbye()
+    await_end(server, "after a goodbye")
+
+
+@server_rule(
+    "stale-segments-removed",
+    ROBUSTNESS,
+    "4",
+    "a starting server removes the segments of a dead agent and waits on",
+)
+def _stale_segments_removed(rig: Rig) -> None:
+    agent = rig.agent()
+    stand_in = hand_over(agent)
+    agent.offer(pid=stand_in.pid, start_time=stand_in.started)
+    stand_in.close()
+    server = rig.start()
+    await_no_segments(rig.rendezvous, rig.timeout)
+    agent.close()
+    _serves_next(rig, rig.rendezvous, server)
+
+
+@server_rule(
+    "abandoned-header-removed",
+    ROBUSTNESS,
+    "4",
+    "a header left without magic for half a second, its lock free, is removed by a starting server",
+)
+def _abandoned_header_removed(rig: Rig) -> None:
+    agent = rig.agent()
+    hand_over(agent).close()
+    server = rig.start()
+    await_no_segments(rig.rendezvous, rig.timeout)
+    agent.close()
+    _serves_next(rig, rig.rendezvous, server)
+
+
+@server_rule(
+    "second-server", ROBUSTNESS, "2", "a second server leaves without writing a byte, and the first serves on"
+)
+def _second_server(rig: Rig) -> None:
+    agent = rig.open()
+    agent.reset(resets(agent))
+    before = bytes(agent.pose)
+    second = rig.start()
+    await_end(second, "as a second client", rig.timeout)
+    demand(
+        bytes(agent.pose) == before, "the pose segment", "not a byte written by a second server", "it changed"
+    )
+    expect("status of a step by the first server", agent.step(commands(agent)).status, 0)
+
+
+@server_rule(
+    "served-session-left",
+    ROBUSTNESS,
+    "2",
+    "a session that another server has served or refused is left untouched",
+)
+def _served_session_left(rig: Rig) -> None:
+    for traces in ("magic", "farewell"):
+        agent = rig.agent(rendezvous=rig.new_rendezvous())
+        agent.offer()
+        if traces == "magic":
+            agent.pose[:8] = b"TUBE.POS"
+        else:
+            write_farewell(agent.pose, Farewell.FAILED, "its engine did not start")
+        before = bytes(agent.pose)
+        server = rig.start(agent.rendezvous)
+        await_end(server, f"since a {traces} stands in the pose segment", rig.timeout)
+        demand(
+            bytes(agent.pose) == before, f"a pose segment with a {traces}", "not a byte written", "it changed"
+        )
+        agent.close()
+
+
+@server_rule(
+    "died-before-magic-replaced",
+    ROBUSTNESS,
+    "2",
+    "a server that died before its magic stood is replaced by another",
+)
+def _died_before_magic_replaced(rig: Rig) -> None:
+    agent = rig.agent()
+    dead = StandIn()
+    for offset, value in ((COMMAND["pid"], dead.pid), (COMMAND["start_time"], dead.started)):
+        agent.pose[offset.bytes] = value.to_bytes(8, "little")
+    dead.close()
+    agent.offer()
+    agent.attend(rig.start())
+    agent.await_header()
+    demand(
+        read_i64(agent.pose, COMMAND["pid"]) != dead.pid, "pid of the header", "the new server's", dead.pid
+    )
+
+
+# --- told to stop ---
+
+
+@server_rule(
+    "told-to-stop",
+    ROBUSTNESS,
+    "8",
+    "a server that is told to stop (SIGTERM or SIGINT) leaves a farewell 1, promptly, idle and at work",
+)
+def _told_to_stop(rig: Rig) -> str:
+    heeded = [number for number in (signal.SIGTERM, signal.SIGINT) if _heeds(rig, number)]
+    names = " and ".join(number.name for number in heeded)
+    demand(bool(heeded), "farewell after SIGTERM or SIGINT", "kind 1", "none after either")
+    return f"after {names}"
+
+
+def _heeds(rig: Rig, number: signal.Signals) -> bool:
+    """Whether a server leaves a farewell 1 on a signal, in both states; a farewell of another kind is a failure."""
+    for state in (State.READY, State.STEPPING):
+        with scene(rig, state) as s:
+            s.server.signal(number)
+            s.go_on()
+            kind, text = s.agent.await_farewell(LEAVING_S)
+            await_end(s.server, f"after {number.name} {s.where}")
+            if not kind:
+                return False
+            demand(
+                kind == Farewell.STOPPED, f"farewell after {number.name} {s.where}", "kind 1", (kind, text)
+            )
+    return True
