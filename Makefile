@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: launch test check format bench clean
+.PHONY: launch test check format bench soak clean
 
 launch: $(VENV)/.fly
 	$(BIN)/cosim launch
@@ -23,6 +23,11 @@ format: $(VENV)/.all
 
 bench: $(VENV)/.all
 	$(BIN)/cosim bench
+
+# What the suite does in seconds, at length: some minutes, on a machine that has nothing else to do.
+soak: $(VENV)/.all
+	$(BIN)/python tests/soak steps --count 1000000
+	$(BIN)/python tests/soak kills --count 500
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -88,6 +88,8 @@ class AgentSession:
         self._number = 0
         self._engine_ns = 0
         self._on_close = on_close
+        self._rendezvous = ""
+        self._remove: Callable[[], None] = _remove_nothing
         self._wait: Wait
         self._offer = Offer(settings, os.urandom(16), pid, start_time(pid))
         self._poses = PoseBatch.zeros(lanes)
@@ -136,32 +138,45 @@ class AgentSession:
             with (
                 held_signals()
             ):  # an interrupt comes before the segments are there, or when they will be removed
-                session = cls._offering(rendezvous, settings)
-            _await_header(session._pose, rendezvous, watch, attach_timeout)
-            answer = handshake.read_answer(session._pose, session._offer)
-            peer = Peer("physics", answer.pid, answer.started, session._pose, watch)
-            session.attached(Waiter(session._reply, _REPLY_DOORBELL, peer, reply_timeout))
-        except BaseException as error:
-            with held_signals():
-                if session is not None:
-                    session._break(error)
-                    session.close()
+                session = cls.offer(rendezvous, settings)
+            session.await_physics(watch, attach_timeout, reply_timeout)
+        except BaseException:
+            if session is not None:
+                session.close()
             raise
         return session
 
     @classmethod
-    def _offering(cls, rendezvous: str, settings: SessionSettings) -> AgentSession:
-        """Create the segments and write the agent's header."""
-        segments = create_segments(parse_rendezvous(rendezvous), settings.lanes)
+    def offer(cls, rendezvous: str, settings: SessionSettings) -> AgentSession:
+        """Take the rendezvous and offer the session there, so that the physics process can be started for it.
 
-        def remove() -> None:
-            segments.unlink()
-            segments.close()
+        `await_physics` goes on. Closing removes the segments.
 
+        Raises:
+            SessionError: the rendezvous is taken or cannot be used, or there is no room.
+        """
+        with held_signals():
+            segments = create_segments(parse_rendezvous(rendezvous), settings.lanes)
+            try:
+                session = cls(segments.command.view, segments.pose.view, settings, segments.close)
+            except BaseException:
+                segments.unlink()
+                raise
+            session._rendezvous, session._remove = rendezvous, segments.unlink
+        return session
+
+    def await_physics(
+        self, watch: Watch | None = None, attach_timeout: float = 30.0, reply_timeout: float | None = None
+    ) -> None:
+        """Wait for a physics process to attach to the session on offer; arguments and errors are those of `open`."""
         try:
-            return cls(segments.command.view, segments.pose.view, settings, remove)
-        except BaseException:
-            segments.unlink()
+            _await_header(self._pose, self._rendezvous, watch, attach_timeout)
+            answer = handshake.read_answer(self._pose, self._offer)
+            peer = Peer("physics", answer.pid, answer.started, self._pose, watch)
+            self.attached(Waiter(self._reply, _REPLY_DOORBELL, peer, reply_timeout))
+        except BaseException as error:
+            with held_signals():
+                self._break(error)
             raise
 
     def attached(self, wait: Wait) -> None:
@@ -247,6 +262,7 @@ class AgentSession:
         """
         with held_signals():
             try:
+                self._remove()  # while the other side still watches: should we be killed now, it removes the rest
                 if self._state is _READY:
                     self._say_goodbye()
                 elif Event.FAREWELL in TRANSITIONS[self._state]:
@@ -335,7 +351,8 @@ class AgentSession:
 
     def _break(self, error: BaseException) -> None:
         """End the session because of `error`, and tell the other side where it may still listen."""
-        handshake.part(self._command, error)
+        self._remove()
+        handshake.part(self._command, error, self._pose)
         events = {PeerViolation: Event.VIOLATION, PeerLost: Event.LOSS}
         self._state = follow(self._state, events.get(type(error), Event.FAREWELL))
 
@@ -344,6 +361,10 @@ _PHASES: Final = {event: event.name.lower() for event in Event}
 _DONE: Final = Status.DONE.value
 _REFUSED: Final = Status.REFUSED.value
 _DONE_EVENT: Final = Event.DONE
+
+
+def _remove_nothing() -> None:
+    """A session in memory has no names to remove."""
 
 
 def _bad_reply(number: int, rung: int, begin: int, end: int) -> str:

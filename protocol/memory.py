@@ -126,7 +126,9 @@ class Segment:
 
     def unlink(self) -> None:
         """Remove the segment's name, unless it is gone already or stands for a newer segment."""
-        if self.path is None or self._descriptor == _CLOSED:  # Windows removes shared memory with its last user
+        if (
+            self.path is None or self._descriptor == _CLOSED
+        ):  # Windows removes shared memory with its last user
             return
         try:
             if os.path.samestat(os.fstat(self._descriptor), self.path.stat()):
@@ -163,9 +165,9 @@ class Segments:
     pose: Segment
 
     def unlink(self) -> None:
-        """Remove both names."""
-        self.command.unlink()
+        """Remove both names, the command segment's last: it tells who left the other behind."""
         self.pose.unlink()
+        self.command.unlink()
 
     def close(self) -> None:
         """Unmap both."""
@@ -243,6 +245,14 @@ def segment_path(rendezvous: Rendezvous, suffix: str) -> Path:
     """Return where the file system shows a segment (Windows shows no shared memory)."""
     folder = SHM_FOLDER if rendezvous.kind == "shm" else Path()
     return folder / (rendezvous.stem + suffix)
+
+
+def is_empty(rendezvous: Rendezvous, suffix: str) -> bool:
+    """Tell whether a segment has a name and no size: its creator is just making it, or was killed over it."""
+    try:
+        return segment_path(rendezvous, suffix).stat().st_size == 0
+    except FileNotFoundError:
+        return False
 
 
 def _map_file(name: str, path: Path, descriptor: int, size: int) -> Segment:

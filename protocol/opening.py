@@ -21,7 +21,9 @@ from protocol.memory import (
     Segment,
     Segments,
     create_segment,
+    is_empty,
     open_segment,
+    segment_path,
 )
 
 _log = logging.getLogger("protocol")
@@ -79,8 +81,11 @@ def _remove_stale(rendezvous: Rendezvous, suffix: str, word: bytes, patient: boo
     name = rendezvous.stem + suffix
     foreign = f"{name} exists and is no session's segment; remove it or use another name"
     segment = open_segment(rendezvous, suffix)
-    if segment is None:  # just created, or just removed by another
-        return foreign
+    if segment is None:  # just being created, or just removed by another
+        if patient or not is_empty(rendezvous, suffix):
+            return foreign
+        segment_path(rendezvous, suffix).unlink(missing_ok=True)
+        return ""
     try:
         found = magic(segment.view)
         if len(segment.view) < _HEADER_BYTES or found not in (word, _NOT_YET):
@@ -115,13 +120,14 @@ def attach_segments(rendezvous: Rendezvous, timeout: float, launcher: int | None
     found = "nothing of that name"
     while True:
         now = time.monotonic()
-        segments, news = _try_attach(rendezvous, patient=now - whole < CREATION_GRACE_S)
+        orphaned = launcher is not None and life(launcher, launched) is Life.DEAD
+        segments, news = _try_attach(rendezvous, patient=not orphaned and now - whole < CREATION_GRACE_S)
         if segments is not None:
             return segments
         if news != _UNFINISHED:
             whole = now  # the last moment without a half-written header
         found = news or found
-        if launcher is not None and life(launcher, launched) is Life.DEAD:
+        if orphaned:
             how = f"ended before a session was offered at {rendezvous}"
             raise PeerLost(f"launcher (pid {launcher})", how, Verdict.EXITED, 0, "attach")
         if now - began > timeout:
@@ -144,13 +150,17 @@ def _try_attach(rendezvous: Rendezvous, patient: bool) -> tuple[Segments | None,
     """
     command = open_segment(rendezvous, COMMAND_SUFFIX)
     if command is None:
-        return None, ""
+        if not is_empty(rendezvous, COMMAND_SUFFIX):
+            return None, ""
+        if not patient:
+            segment_path(rendezvous, COMMAND_SUFFIX).unlink(missing_ok=True)
+        return None, _UNFINISHED
     pose = open_segment(rendezvous, POSE_SUFFIX)
     try:
         news = _not_on_offer(command)
         abandoned = news == _DEAD_AGENT or (news == _UNFINISHED and not patient)
         if abandoned and command.lock():
-            for segment in (command, pose):
+            for segment in (pose, command):
                 if segment is not None:
                     segment.unlink()
         if news:
