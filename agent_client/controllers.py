@@ -33,6 +33,9 @@ DEFAULT_LOOKAHEAD: Final = 1.0
 class Controller(ABC):
     """Chooses the commands of N lanes."""
 
+    entropy: Floats | float = math.nan
+    """Of the distributions that the last actions were chosen from (nat), (N,); NaN where there are none."""
+
     @abstractmethod
     def act(self, step: TaskStep, commands: CommandBatch, actions: Ints) -> None:
         """Fill in direction and speed of every lane, and nothing else of the command.
@@ -46,6 +49,11 @@ class Controller(ABC):
 
 class ActingPolicy(Protocol):
     """Whatever maps observations to actions."""
+
+    @property
+    def entropies(self) -> Floats | float:
+        """Of the distributions that the last actions were chosen from (nat), (N,); NaN where there are none."""
+        ...
 
     def act(self, observations: Singles) -> Ints:
         """Action indices (N,) for observations (N, 37 L)."""
@@ -75,6 +83,7 @@ class PolicyController(Controller):
             self._history = ObservationHistory(len(actions), self._lags)
         self._history.follow(step)
         actions[:] = self.policy.act(self._history.stack())
+        self.entropy = self.policy.entropies
         decode(actions, step.frame, self._table.local, self._table.speed, commands.raw)
 
 

@@ -44,6 +44,8 @@ class FlightStep:
     """Pose block that answered it (`protocol.plant.PoseBatch.raw`)."""
     actions: Ints  # (N,)
     """Actions that made the command, or `agent_client.controllers.CONTINUOUS`."""
+    entropy: Floats  # (N,)
+    """Entropy of the distribution that they were chosen from (nat), NaN where there is none."""
     task: TaskStep
     """What came of the pose: observation, reward, outcome, sensors."""
     phases: Ints  # (5,)
@@ -158,6 +160,7 @@ class _Loop:
         self._path = CommandPath(task.lanes, session.description.speed_max)
         self._actions: Ints = np.full(task.lanes, CONTINUOUS, dtype=np.int64)
         self._totals: Ints = np.zeros(len(PHASES), dtype=np.int64)
+        self._entropy: Floats | float = np.nan
         self._stopped = False
         self._over = 0
         self._step: FlightStep
@@ -171,8 +174,9 @@ class _Loop:
         if drawn is not None:
             self._path.begin(lanes, drawn, state, self._commands)
         phases: Ints = np.zeros_like(self._totals)
+        unknown = np.full(self._task.lanes, np.nan)
         command = np.zeros_like(self._commands.raw)
-        self._step = FlightStep(0, command, poses.raw, self._actions.copy(), state, phases)
+        self._step = FlightStep(0, command, poses.raw, self._actions.copy(), unknown, state, phases)
 
     def goes_on(self) -> bool:
         """Whether nobody stopped the flight and a lane still flies."""
@@ -187,6 +191,7 @@ class _Loop:
         sent = self._path.send(self._commands, step.task)
         if self._over:  # whatever is still on its way to them, or blows there
             sent.speed[step.task.outcome != int(Outcome.RUNNING)] = 0.0
+        self._entropy = self._controller.entropy
         decided = clock()
         poses = self._session.step(sent, self.report)
         answered = clock()
@@ -205,6 +210,7 @@ class _Loop:
         step.pose = poses.raw
         step.command[:] = sent.raw
         step.actions[:] = self._actions
+        step.entropy[:] = self._entropy
 
     def report(self) -> None:
         """Show the last step to `on_step`."""

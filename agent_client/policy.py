@@ -75,6 +75,8 @@ class Policy:
         self._work = np.zeros((2, int(self._sizes.max())), dtype=np.float32)
         self._logits = np.zeros((1, ACTIONS), dtype=np.float32)
         self._actions = np.zeros(1, dtype=np.int64)
+        self.entropies = np.zeros(1)
+        """Of the distributions that the last actions were chosen from (nat), (N,)."""
         # Loads compiled code now, which would else hold up the first control step by some ten milliseconds.
         self.act(np.zeros((1, len(self._mean)), dtype=np.float32))
 
@@ -89,7 +91,7 @@ class Policy:
             Action indices (N,), overwritten by the next call.
         """
         self.logits(observations)
-        _argmax(self._logits, self._actions)
+        _choose(self._logits, self._actions, self.entropies)
         return self._actions
 
     def logits(self, observations: Floats32) -> Floats32:
@@ -98,6 +100,7 @@ class Policy:
         if lanes != self._logits.shape[0]:
             self._logits = np.zeros((lanes, ACTIONS), dtype=np.float32)
             self._actions = np.zeros(lanes, dtype=np.int64)
+            self.entropies = np.zeros(lanes)
         _forward(
             observations, self._mean, self._scale, self._clip,
             self._weights, self._sizes, self._activation, self._work, self._logits,
@@ -215,10 +218,18 @@ def _forward(
 
 
 @njit(cache=True)
-def _argmax(logits: Floats32, actions: Ints) -> None:
+def _choose(logits: Floats32, actions: Ints, entropies: NDArray[np.float64]) -> None:
+    """Take the most likely action of each row, and the entropy of the distribution: log Z - sum of p l."""
     for row in range(logits.shape[0]):
         best = 0
         for j in range(1, logits.shape[1]):
             if logits[row, j] > logits[row, best]:
                 best = j
         actions[row] = best
+        total, mean = 0.0, 0.0
+        for j in range(logits.shape[1]):
+            below = np.float64(logits[row, j]) - np.float64(logits[row, best])
+            weight = math.exp(below)
+            total += weight
+            mean += weight * below
+        entropies[row] = math.log(total) - mean / total

@@ -44,7 +44,7 @@ from cosim.supervise import PhysicsProcess, physics_command
 from cosim.versions import versions
 from meshes.tube import INDUSTRIAL
 from protocol.agent import AgentSession, SessionSettings
-from protocol.plant import PARAMETERS
+from protocol.plant import PARAMETERS, ResetBatch
 
 TUBE: Final = 0
 """Index under which the flight's tube is registered."""
@@ -158,7 +158,7 @@ def _fly_recorded(flight: Flight) -> dict[str, Any]:
         drawn=drawn,
     )
     chosen = dict(zip(names, resets.parameters[0, : len(names)].tolist(), strict=True))
-    manifest = _manifest(flight, drawn, defaults, chosen)
+    manifest = _manifest(flight, drawn, defaults, chosen) | {"reset": _reset_described(resets)}
     recorder = Recorder(folder, manifest, episode_dtype(pilot.settings.lidar.rays))
     status, report = "failed", dict[str, Any]()
     try:
@@ -263,6 +263,12 @@ def _summarise(report: dict[str, Any], pilot: Pilot, conduit: Conduit, say: Call
         f"{report['contacts']} steps with contact"
     )
     say(f"  trajectory {report['trajectory_hash'][:16]}…, recorded in {report['run_dir']}")
+
+
+def _reset_described(resets: ResetBatch) -> dict[str, Any]:
+    """What a lane was reset to, beside the parameters: whoever flies it again asks for the same bits."""
+    state = ("position", "quaternion", "linear_velocity", "angular_velocity")
+    return {name: getattr(resets, name)[0].tolist() for name in state} | {"seed": int(resets.seed[0])}
 
 
 def _manifest(

@@ -3,6 +3,8 @@
 The log `steps.bin` is the source of truth; every other format is made from it. Record 0 is the reset pose,
 record k the control step k. The chain is h_k = SHA-256(h_{k-1} + command bytes + pose bytes), h_{-1} empty,
 over the payload rows as they crossed the protocol and never over timings; the last h is `trajectory_hash`.
+Beside it every record carries a CRC-32 of all its bytes, and the manifest its own SHA-256, so that whatever was
+changed afterwards is found (`cosim verify`).
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import hashlib
 import json
 import os
 import time
+import zlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -26,7 +29,8 @@ from protocol.plant import COMMAND_WORDS, POSE_WORDS
 
 MANIFEST: Final = "manifest.json"
 LOG: Final = "steps.bin"
-FORMAT: Final = 1
+FORMAT: Final = 2
+DIGEST: Final = "manifest_sha256"
 
 COMMAND_BYTES: Final = 8 * COMMAND_WORDS
 POSE_BYTES: Final = 8 * POSE_WORDS
@@ -67,11 +71,14 @@ PAYLOAD: Final[tuple[_Field, ...]] = (
 ADDED: Final[tuple[_Field, ...]] = (
     ("chain", "|u1", (32,), "1", "", ()),
     ("action", "<i8", (), "index", "", ()),
+    ("entropy", "<f8", (), "nat", "of the policy's distribution over the actions", ()),
     ("phases", "<i8", (len(PHASES),), "ns", "", PHASES),
     ("recording", "<i8", (), "ns", "of the record before", ()),
     ("observation", "<f4", (len(FEATURES),), "1", "", FEATURE_NAMES),
+    ("check", "<u4", (), "CRC-32 of the record with this field zero", "", ()),
 )
-"""What the flight adds: link of the hash chain, action (-1: none of the table), timings, observation."""
+"""What the flight adds: link of the hash chain, action (-1: none of the table) and the entropy of the choice (NaN:
+no distribution), timings, observation, check sum."""
 
 EPISODE: Final[dict[str, tuple[str, str, tuple[str, ...]]]] = {
     "reward": ("1", "", ()),
@@ -144,6 +151,12 @@ def next_link(chain: bytes, payload: bytes) -> bytes:
     return hashlib.sha256(chain + payload).digest()
 
 
+def manifest_digest(manifest: dict[str, Any]) -> str:
+    """SHA-256 over all of a manifest but its own digest, in hexadecimal."""
+    rest = {key: value for key, value in manifest.items() if key != DIGEST}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
+
+
 class Recorder:
     """Writes one flight of one lane; every record is with the operating system before the next is made.
 
@@ -167,6 +180,7 @@ class Recorder:
         self._pose = self._payload.view(np.float64)[COMMAND_WORDS:]
         self._link, self._phases, self._observation = row["chain"], row["phases"], row["observation"]
         self._action, self._recording = self._row["action"], self._row["recording"]
+        self._entropy, self._check = self._row["entropy"], self._row["check"]
         self._record, self._episode = words.data, words[_episode_offset() :]
         self._chain = b""
         self.records = 0
@@ -199,10 +213,13 @@ class Recorder:
         self._chain = next_link(self._chain, self._payload.tobytes())
         self._link[:] = np.frombuffer(self._chain, np.uint8)
         self._action[0] = step.actions[0]
+        self._entropy[0] = step.entropy[0]
         self._phases[:] = step.phases
         self._observation[:] = step.task.observation[0]
         # As bytes: copied field by field it would take ten times as long.
         self._episode[:] = step.task.episodes.view(np.uint8)
+        self._check[0] = 0
+        self._check[0] = zlib.crc32(self._record)
         try:
             if self._log.write(self._record) != len(self._record):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # a raw file may take half a record
@@ -217,6 +234,7 @@ class Recorder:
         """Write the manifest so that a reader finds either the old one or the new one, whole."""
         path = self.folder / MANIFEST
         partial = path.with_suffix(".partial")
+        self.manifest[DIGEST] = manifest_digest(self.manifest)
         try:
             partial.write_text(json.dumps(self.manifest, indent=1, allow_nan=False) + "\n")
             partial.replace(path)

@@ -63,6 +63,8 @@ def test_a_policy_sees_the_observation_and_its_actions_become_commands(
     seen = []
 
     class Fixed:
+        entropies = math.nan
+
         def act(self, observations: np.ndarray) -> np.ndarray:
             seen.append(observations)
             return np.array([2, 7])
@@ -86,6 +88,8 @@ def test_a_policy_with_a_history_sees_its_lags_side_by_side(cylinder: Maker, pos
     seen = []
 
     class Straight:
+        entropies = math.nan
+
         def act(self, observations: np.ndarray) -> np.ndarray:
             seen.append(observations.copy())
             return np.zeros(len(observations), dtype=np.int64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -28,6 +29,8 @@ Maker = Callable[..., Any]
 
 class Follower:
     """A policy that looks at the target's direction: any rule that uses the observation."""
+
+    entropies = math.nan
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Straight, right, left, up or down, at the fastest speed."""
@@ -281,6 +284,8 @@ def test_a_policy_sees_what_is_as_old_as_the_delay(cylinder: Maker) -> None:
     given: list[np.ndarray] = []
 
     class Straight:
+        entropies = math.nan
+
         def act(self, observations: np.ndarray) -> np.ndarray:
             given.append(observations.copy())
             return np.full(len(observations), 3)

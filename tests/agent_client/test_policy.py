@@ -102,6 +102,8 @@ def test_the_chosen_action_is_the_most_likely_one() -> None:
     np.testing.assert_array_equal(policy.act(x), log_p.argmax(axis=1))
     np.testing.assert_allclose(np.exp(log_p).sum(axis=1), 1.0, atol=1e-12)
     np.testing.assert_allclose(policy.entropy(x), -(np.exp(log_p) * log_p).sum(axis=1), atol=1e-12)
+    policy.act(x)
+    np.testing.assert_allclose(policy.entropies, policy.entropy(x), atol=1e-12)
 
 
 def test_sampled_actions_follow_their_probabilities() -> None:

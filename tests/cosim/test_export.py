@@ -68,7 +68,7 @@ def test_parquet_is_read_back_by_pyarrow_with_units(run: Run, tmp_path: Path) ->
     table = pq.read_table(export(run.folder, "parquet", tmp_path / "run.parquet"))
     assert table["position_x"].to_pylist() == run.records["position"][:, 0].tolist()
     assert table.schema.field("position_x").metadata == {b"unit": b"m", b"frame": b"world"}
-    assert json.loads(table.schema.metadata[b"cosim.manifest"])["format"] == 1
+    assert json.loads(table.schema.metadata[b"cosim.manifest"])["format"] == 2
 
 
 def test_an_export_never_replaces_the_run_itself(run: Run) -> None:
@@ -96,5 +96,5 @@ def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="JSON"):
         read_run(tmp_path)
     (tmp_path / "manifest.json").write_text('{"format": 99}')
-    with pytest.raises(RunError, match="expected 1, found 99"):
+    with pytest.raises(RunError, match="expected 2, found 99"):
         read_run(tmp_path)
