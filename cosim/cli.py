@@ -13,7 +13,7 @@ from typing import Any, Final
 import click
 
 from cosim import __version__
-from cosim.errors import INTERNAL, Terminated, exit_status
+from cosim.errors import INTERNAL, PEER, Terminated, exit_status
 from cosim.named_settings import SettingsCommand, take_settings
 from cosim.options import FlightOptions, evaluate_options, flight_options
 
@@ -221,6 +221,36 @@ def bench(as_json: bool, quick: bool, training: bool) -> None:
     from cosim.bench import bench as run
 
     run(as_json=as_json, quick=quick, training=training)
+
+
+@cosim.command(short_help="Show the live state of a running session, without disturbing it.")
+@click.argument("session", required=False)
+@click.option(
+    "--interval",
+    type=click.FloatRange(min=0.01),
+    metavar="S",
+    help="Between two reports [default: 0.1 on a terminal, else 1].",
+)
+@click.option(
+    "--wait", type=click.FloatRange(min=0.0), default=0.0, metavar="S", help="For a session to come."
+)
+@click.option("--once", is_flag=True, help="One report, then the end.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
+def watch(as_json: bool, **options: Any) -> None:
+    """Show the live state of SESSION (a name, shm:NAME or file:/path/stem), or of the only one that runs.
+
+    Reads shared memory and writes nothing. Ends with the session and says why: 0 after its goodbye, else 3.
+    Ctrl-C ends the watching alone.
+
+    \b
+    cosim launch --session mine --realtime 1 &
+    cosim watch mine --wait 10
+    """
+    from cosim.watch import WatchOptions
+    from cosim.watch import watch as run
+
+    if not run(WatchOptions(**options), as_json=as_json):
+        sys.exit(PEER)
 
 
 def _interrupted(number: int, _frame: FrameType | None) -> None:
