@@ -339,7 +339,7 @@ static bool answer(session *s)
     memcpy(s->commands, tube_commands(command), (size_t)s->settings.lanes * sizeof *s->commands);
     const int64_t begin = acquire(&command->begin), end = acquire(&command->end);
     if (begin != due || end != due)
-        return end_session(s, TUBE_END_VIOLATION, "wrote a torn request: begin %" PRId64 ", end %" PRId64, begin, end);
+        return end_session(s, TUBE_END_VIOLATION, "tore a request: begin %" PRId64 ", end %" PRId64, begin, end);
     const int64_t op = command->op, asked = command->step, next = s->steps + (op == TUBE_OP_STEP);
     if (op < TUBE_OP_STEP || op > TUBE_OP_GOODBYE)
         return end_session(s, TUBE_END_VIOLATION, "asked for an unknown op %" PRId64, op);

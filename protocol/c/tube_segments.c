@@ -70,29 +70,27 @@ bool tube_agent_is_dead(const tube_segments *segments)
 
 static void unmap(tube_segment *segment)
 {
-    if (segment->descriptor < 0)
-        return;
-    munmap(segment->memory, (size_t)segment->bytes);
-    close(segment->descriptor);
+    if (segment->memory != NULL)
+        munmap(segment->memory, (size_t)segment->bytes);
+    if (segment->descriptor >= 0)
+        close(segment->descriptor);
     segment->descriptor = -1;
+    segment->memory = NULL;
 }
 
+// Opens and maps a segment; one without a size, whose creator is not so far, is open but has no memory.
 static bool map(tube_segment *segment, int protection)
 {
     struct stat file;
-    const int descriptor = open(segment->path, O_RDWR | O_CLOEXEC);
-    if (descriptor < 0)
+    segment->descriptor = open(segment->path, O_RDWR | O_CLOEXEC);
+    if (segment->descriptor < 0 || fstat(segment->descriptor, &file) != 0)
         return false;
-    if (fstat(descriptor, &file) == 0 && file.st_size > 0) {
-        segment->bytes = file.st_size;
-        segment->memory = mmap(NULL, (size_t)file.st_size, protection, MAP_SHARED, descriptor, 0);
-        if (segment->memory != MAP_FAILED) {
-            segment->descriptor = descriptor;
-            return true;
-        }
-    }
-    close(descriptor);
-    return false;
+    segment->bytes = file.st_size;
+    if (file.st_size == 0)
+        return true;
+    void *memory = mmap(NULL, (size_t)file.st_size, protection, MAP_SHARED, segment->descriptor, 0);
+    segment->memory = memory == MAP_FAILED ? NULL : memory;
+    return segment->memory != NULL;
 }
 
 static bool lock(const tube_segment *segment)
@@ -135,10 +133,10 @@ tube_look tube_look_for_session(tube_segments *segments, bool patient)
 {
     tube_segment *command = &segments->command, *pose = &segments->pose;
     tube_close(segments); // of the look before
-    if (!map(command, PROT_READ) || command->bytes < HEADER_BYTES)
+    if (!map(command, PROT_READ) || (command->bytes > 0 && command->bytes < HEADER_BYTES))
         return TUBE_LOOK_NOTHING;
     const tube_command_segment *header = command->memory;
-    const int64_t magic = __atomic_load_n(&header->magic, __ATOMIC_ACQUIRE);
+    const int64_t magic = header == NULL ? 0 : __atomic_load_n(&header->magic, __ATOMIC_ACQUIRE);
     if (magic == 0 && patient)
         return TUBE_LOOK_UNFINISHED;
     if (magic == 0 || tube_agent_is_dead(segments)) {
@@ -150,7 +148,7 @@ tube_look tube_look_for_session(tube_segments *segments, bool patient)
     const bool left = __atomic_load_n(&header->farewell, __ATOMIC_ACQUIRE) != TUBE_FAREWELL_NONE;
     if (magic == TUBE_COMMAND_MAGIC && left) // a foreign magic is left to the handshake, which names it
         return TUBE_LOOK_NOTHING;
-    if (!map(pose, PROT_READ | PROT_WRITE) || !is_named(command)) // a new agent has just taken its place
+    if (!map(pose, PROT_READ | PROT_WRITE) || !is_named(command)) // not so far, or just replaced by a new agent's
         return TUBE_LOOK_NOTHING;
     if (pose->bytes < HEADER_BYTES)
         return TUBE_LOOK_TOO_SHORT;

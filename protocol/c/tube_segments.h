@@ -11,7 +11,7 @@ typedef struct tube_segment {
     char path[4104];
     int descriptor; // -1: not open
     int64_t bytes;
-    void *memory;
+    void *memory; // NULL: not mapped
 } tube_segment;
 
 typedef struct tube_segments {
