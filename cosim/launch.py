@@ -92,6 +92,7 @@ def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
         if command is None:
             say(f"waiting for a physics peer at {rendezvous} (at most {options.attach_timeout:g} s)")
         else:
+            say(f"session: {rendezvous} (cosim watch shows its live state)")
             process = stack.enter_context(PhysicsProcess(command, rendezvous, folder))
         if mesh is None:
             conduit = generate_conduit(options, recipe, folder)
