@@ -28,6 +28,7 @@ bench: $(VENV)/.all
 soak: $(VENV)/.all
 	$(BIN)/python tests/soak steps --count 1000000
 	$(BIN)/python tests/soak kills --count 500
+	$(BIN)/python tests/soak pauses --count 10
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

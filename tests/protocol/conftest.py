@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import secrets
 import subprocess
@@ -11,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -23,6 +25,7 @@ from protocol.twin import open_twin
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
 PATIENCE_S = 20.0
+SOAK_PATIENCE_S = 120.0
 
 
 def _load_peers() -> ModuleType:
@@ -176,3 +179,22 @@ def eventually() -> Callable[[Callable[[], bool]], None]:
             time.sleep(0.005)
 
     return wait
+
+
+@pytest.fixture(scope="session")
+def soak() -> Callable[..., dict[str, Any]]:
+    """Run `tests/soak`, which forks its peers and so wants a process without threads, and return what it found."""
+
+    def run(*arguments: str) -> dict[str, Any]:
+        done = subprocess.run(
+            [sys.executable, str(ROOT / "tests" / "soak"), *arguments, "--json"],
+            check=False,
+            capture_output=True,
+            text=True,
+            timeout=SOAK_PATIENCE_S,
+            env=os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"},
+        )
+        assert done.stdout, done.stderr
+        return dict(json.loads(done.stdout))
+
+    return run

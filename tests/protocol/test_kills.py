@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,10 @@ from protocol.physics import serve
 from protocol.toy import ToyPlant
 
 ROOT = Path(__file__).parents[2]
-SOAK = ROOT / "tests" / "soak"
 BOUND_MS = 100.0
-DEADLINE_S = 120.0
+
+Start = Callable[..., subprocess.Popen[str]]
+Soak = Callable[..., dict[str, Any]]
 
 DIE_LEAVING = """
 import os, signal, sys
@@ -43,18 +43,7 @@ with agent.AgentSession.open(sys.argv[1], agent.SessionSettings(1, 0.1, 0.1), at
 """
 
 
-def soak(*arguments: str) -> dict[str, Any]:
-    """Run the soak program and return what it found, well or not."""
-    done = subprocess.run(
-        [sys.executable, str(SOAK), *arguments, "--json"],
-        check=False, capture_output=True, text=True, timeout=DEADLINE_S,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"},
-    )  # fmt: skip
-    assert done.stdout, done.stderr
-    return dict(json.loads(done.stdout))
-
-
-def test_every_random_kill_is_noticed_and_leaves_nothing() -> None:
+def test_every_random_kill_is_noticed_and_leaves_nothing(soak: Soak) -> None:
     """Thirty kills of either side anywhere: typed errors, no hang, no segment, within the bound on a free core."""
     found = soak("kills", "--count", "30")
     assert found["faults"] == []
@@ -65,7 +54,7 @@ def test_every_random_kill_is_noticed_and_leaves_nothing() -> None:
 
 @pytest.mark.parametrize("last", ["goodbye", "farewell"])
 def test_an_agent_that_is_killed_while_it_leaves_has_nothing_left(
-    rendezvous: str, start: Any, last: str
+    rendezvous: str, start: Start, last: str
 ) -> None:
     """Killed right after its goodbye or its farewell, when nobody watches any more: the names are gone (the fixture
     looks)."""

@@ -1,7 +1,8 @@
-"""`python tests/soak steps|kills`: what takes too long for every run of the suite, which does the same shorter.
+"""`python tests/soak steps|kills|pauses`: at length what every run of the suite does in seconds.
 
-steps   so many control steps over either transport, every word of which is checked on both sides
-kills   so many random kills of either side, each of which must be noticed in time and leave nothing
+steps    so many control steps over either transport, every word of which is checked on both sides
+kills    so many random kills of either side, each of which must be noticed in time and leave nothing
+pauses   so many rounds of one flight, frozen, slowed, on other cores, by other ways to wait: always the same bytes
 
 Exit status 0 if all is well.
 """
@@ -15,6 +16,7 @@ import sys
 from typing import Any
 
 from kills import BOUND_S, run_kills
+from pauses import run_pauses
 from steps import run_steps
 
 TRANSPORTS = ("shm", "file")
@@ -23,22 +25,20 @@ TRANSPORTS = ("shm", "file")
 def main() -> int:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(prog="python tests/soak", description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("steps", "kills"))
+    parser.add_argument("what", choices=("steps", "kills", "pauses"))
     parser.add_argument("--count", type=int, required=True)
-    parser.add_argument("--seed", type=int, default=0, help="of the kills")
-    parser.add_argument(
-        "--json", action="store_true", help="one JSON object on stdout and no verdict on times"
-    )
+    parser.add_argument("--seed", type=int, default=0, help="of the random moments")
+    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     asked = parser.parse_args()
     logging.disable(logging.WARNING)  # an agent whose server was killed at the goodbye says so
-    report, well = _steps(asked.count) if asked.what == "steps" else _kills(asked.count, asked.seed)
+    run = {"steps": _steps, "kills": _kills, "pauses": _pauses}[asked.what]
+    report, well = run(asked.count, asked.seed)
     sys.stdout.write(json.dumps(report) + "\n" if asked.json else _text(report))
     return 0 if well else 1
 
 
-def _steps(count: int) -> tuple[dict[str, Any], bool]:
-    runs = [run_steps(count, transport) for transport in TRANSPORTS]
-    return {run["transport"]: run for run in runs}, True
+def _steps(count: int, _seed: int) -> tuple[dict[str, Any], bool]:
+    return {transport: run_steps(count, transport) for transport in TRANSPORTS}, True
 
 
 def _kills(count: int, seed: int) -> tuple[dict[str, Any], bool]:
@@ -47,13 +47,25 @@ def _kills(count: int, seed: int) -> tuple[dict[str, Any], bool]:
     return report | {"within_bound": in_time}, in_time and not report["faults"]
 
 
+def _pauses(count: int, seed: int) -> tuple[dict[str, Any], bool]:
+    rounds = [run_pauses(seed + number) for number in range(count)]
+    flights = {
+        name: {
+            "hash": ", ".join(sorted({flown[name]["hash"] for flown in rounds})),
+            "freezes": sum(flown[name]["freezes"] for flown in rounds),
+        }
+        for name in rounds[0]
+    }
+    return flights, len({flight["hash"] for flight in flights.values()}) == 1
+
+
 def _text(report: dict[str, Any]) -> str:
-    lines = []
+    lines, width = [], max(map(len, report))
     for name, value in report.items():
         if name == "steps":
             value = f"from {value[0]} to {value[-1]}, median {value[len(value) // 2]}"
         shown = ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else value
-        lines.append(f"{name:22} {shown}")
+        lines.append(f"{name:{width}}  {shown}")
     return "\n".join(lines) + "\n"
 
 
