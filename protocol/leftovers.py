@@ -3,6 +3,7 @@
 Death is proved, never guessed: the owner's pid with its start time is gone and nobody holds the segment's lock. A
 header that was never finished counts once it has stood for half a second and nobody holds its lock. Whatever is not
 a segment of this protocol is left alone, and so is everything of a session of which either side may still live.
+An empty file proves nothing and takes no memory: the next session of that name removes it.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from protocol.memory import (
     SHM_FOLDER,
     Rendezvous,
     Segment,
+    is_empty,
     is_ours,
     open_segment,
     parse_rendezvous,
@@ -105,9 +107,12 @@ def remove(rendezvous: Rendezvous) -> None:
         if command is None and pose is None:
             return
         _demand_dead(_judge(rendezvous, command, pose))
-        for segment in reversed(segments):  # `.cmd` last: its lock is what a new agent asks for
+        # `.cmd` last: its lock is what a new agent asks for.
+        for segment, suffix in ((segments[1], POSE_SUFFIX), (segments[0], COMMAND_SUFFIX)):
             if segment is not None:
                 segment.unlink()
+            elif is_empty(rendezvous, suffix):  # the agent died before it had given it a size
+                segment_path(rendezvous, suffix).unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
