@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from protocol import handshake, layout
+from protocol import layout
 from protocol.conformance.raw_agent import RawAgent, Reply
 from protocol.conformance.rig import Rig, await_end, segments_left
 from protocol.conformance.rule import Failure, Level, Skip, demand, expect, server_rule
@@ -15,7 +15,6 @@ from protocol.conformance.sound import (
     commands,
     done,
     fly,
-    put_tube,
     refused,
     register,
     release,
@@ -25,7 +24,7 @@ from protocol.conformance.sound import (
     write_box,
 )
 from protocol.errors import RefusalCode
-from protocol.layout import COMMAND, POSE, Farewell, Op, Status
+from protocol.layout import COMMAND, Farewell, Op, Status
 from protocol.states import TRANSITIONS, Event, State
 
 _MOMENT_S: Final = 0.05
@@ -239,101 +238,6 @@ def fly_a_little(agent: RawAgent) -> None:
     """A reset and two steps."""
     done(agent.reset(resets(agent)), "a reset")
     fly(agent, commands(agent), 2)
-
-
-@server_rule(
-    "agent-farewell-idle",
-    Level.CORE,
-    "8",
-    "the agent's farewell between requests ends the server",
-    covers=((State.READY, Event.FAREWELL),),
-)
-def agent_farewell_idle(rig: Rig) -> None:
-    """The server unmaps the segments, removes nothing, and leaves."""
-    agent = rig.open()
-    fly_a_little(agent)
-    _leave(agent)
-    _ends_with_segments(agent)
-
-
-def _leave(agent: RawAgent) -> None:
-    handshake.write_farewell(agent.command, Farewell.STOPPED, "it was told to stop")
-
-
-def _ends_with_segments(agent: RawAgent) -> None:
-    assert agent.process is not None
-    await_end(agent.process, "after the agent's farewell")
-    expect("segments of a living agent that said farewell", len(segments_left(agent.rendezvous)), 2)
-
-
-def _leave_while(event: Event) -> None:
-    """Register the rule that the agent's farewell right behind a request ends the server."""
-    busy = TRANSITIONS[State.READY][event]
-
-    @server_rule(
-        f"agent-farewell-{busy.name.lower()}",
-        Level.CORE,
-        "8",
-        f"the agent's farewell in state {busy.name} ends the server",
-        covers=((busy, Event.FAREWELL),),
-    )
-    def farewell(rig: Rig) -> None:
-        agent = rig.open()
-        fly_a_little(agent)
-        agent.put_commands(commands(agent))
-        put_tube(agent, 0, write_box(rig.folder / "box.obj"))
-        agent.request(int(event))
-        _leave(agent)
-        _ends_with_segments(agent)
-        rung = agent.reply().doorbell
-        if rung == agent.number:
-            reply = agent.await_reply()
-            demand(reply.status in tuple(Status), "status of the last reply", "0 or 1", reply.status)
-
-    farewell.__doc__ = f"The server may answer {event.name.lower()} first, with a reply that is whole."
-
-
-for _event in (Event.STEP, Event.RESET, Event.REGISTER_TUBE, Event.RELEASE_TUBE, Event.GOODBYE):
-    _leave_while(_event)
-
-
-@server_rule(
-    "second-client", Level.CORE, "2", "a second server at the same session leaves without writing a byte"
-)
-def second_client(rig: Rig) -> None:
-    """It finds the lock taken; the first one is not disturbed."""
-    agent = rig.open()
-    fly_a_little(agent)
-    before = bytes(agent.pose)
-    await_end(rig.start(), "since another server holds the session")
-    _same_bytes("the pose segment after a second server came", bytes(agent.pose), before)
-    expect("segments of a served session", len(segments_left(agent.rendezvous)), 2)
-    fly(agent, commands(agent), 1)
-
-
-@server_rule("served-once", Level.CORE, "2", "a session that was served is not served again")
-def served_once(rig: Rig) -> None:
-    """After the first server's orderly end another one leaves without writing a byte."""
-    agent = rig.open()
-    done(agent.goodbye(), "goodbye")
-    assert agent.process is not None
-    await_end(agent.process, "after the goodbye")
-    before = bytes(agent.pose)
-    await_end(rig.start(), "since the session was served", rig.timeout)
-    _same_bytes("the pose segment after another server came", bytes(agent.pose), before)
-
-
-@server_rule(
-    "first-server-died", Level.CORE, "2", "a server that died before its magic did not serve: another may"
-)
-def first_server_died(rig: Rig) -> None:
-    """A pose segment with a pid, and neither magic nor farewell, is taken over."""
-    agent = rig.agent()
-    layout.write_i64(agent.pose, POSE["pid"], 2**22 + 1)  # beyond the pids of Linux: no such process
-    agent.offer()
-    agent.attend(rig.start())
-    agent.await_header()
-    fly_a_little(agent)
 
 
 @server_rule("payload-words-left", Level.CORE, "6", "words that a request does not use are not looked at")

@@ -175,41 +175,6 @@ def waits_for_agent(rig: Rig) -> None:
     agent.await_header()
 
 
-@server_rule("waits-for-magic", Level.CORE, "4", "a header without its magic is not read", covers=_ATTACH)
-def waits_for_magic(rig: Rig) -> None:
-    """The agent takes its time between header and magic; what it corrects before the magic counts."""
-    agent = rig.agent()
-    agent.put_header(version_major=99)
-    agent.attend(rig.start())
-    time.sleep(0.6)
-    expect("magic of the pose segment before the agent's", handshake.magic(agent.pose), _NO_MAGIC)
-    agent.put_header()
-    agent.publish()
-    agent.await_header()
-
-
-@server_rule(
-    "passes-over-farewell",
-    Level.CORE,
-    "4",
-    "the segments of a living agent that has said farewell are passed over",
-)
-def passes_over_farewell(rig: Rig) -> None:
-    """The server does not attach to them, leaves them there, and serves the agent that comes next."""
-    gone = rig.agent()
-    gone.put(farewell=int(Farewell.STOPPED), farewell_text=b"it changed its mind")
-    gone.offer()
-    process = rig.start()
-    time.sleep(0.4)
-    expect("magic of the pose segment", handshake.magic(gone.pose), _NO_MAGIC)
-    expect("segments that are left", len(segments_left(rig.rendezvous)), 2)
-    gone.close()
-    agent = rig.agent()
-    agent.offer()
-    agent.attend(process)
-    agent.await_header()
-
-
 # --- headers that are not accepted ---
 
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 LOOK_S: Final = 0.01
 _NO_MAGIC: Final = bytes(8)
 _HEADER: Final = slice(8, 1024)
+_REQUEST_AT: Final = COMMAND["begin"].offset
 _DOORBELL: Final = COMMAND["doorbell"].word
 _REPLY_DOORBELL: Final = POSE["doorbell"].word
 
@@ -82,6 +83,7 @@ class RawAgent:
         self.command, self.pose = self._segments.command.view, self._segments.pose.view
         self.words, self._reply = self.command.cast("q"), self.pose.cast("q")
         self.session = os.urandom(16)
+        self._waiter: Waiter | None = None
 
     # --- handshake ---
 
@@ -110,6 +112,7 @@ class RawAgent:
     def attend(self, process: PeerProcess) -> None:
         """Name the process whose end also ends every wait."""
         self.process = process
+        self._waiter = None
 
     def await_header(self, timeout: float | None = None) -> None:
         """Wait until the server's magic stands.
@@ -174,8 +177,12 @@ class RawAgent:
         """
         number = self.number + 1
         step = self.steps + 1 if op == Op.STEP else self.steps
-        sound = {"begin": number, "op": op, "step": step, "end": number, "doorbell": number}
-        self.put(**{**sound, **words})
+        if words:
+            sound = {"begin": number, "op": op, "step": step, "end": number, "doorbell": number}
+            self.put(**{**sound, **words})
+        else:  # what is measured must not be slowed down by names
+            layout.REQUEST.pack_into(self.command, _REQUEST_AT, number, op, step, number)
+            self.put(doorbell=number)
         self.number = number
         return number
 
@@ -185,7 +192,7 @@ class RawAgent:
         Raises:
             Failure: the server left or ended, took too long, or rang with another number.
         """
-        self._wait(self.timeout if timeout is None else timeout)
+        self.await_bell(timeout)
         reply = self.reply()
         number = self.number
         if not reply.doorbell == reply.begin == reply.end == number:
@@ -194,13 +201,21 @@ class RawAgent:
         self.steps = reply.step
         return reply
 
-    def _wait(self, timeout: float) -> None:
-        process = self.process
-        watch = process.watch if process is not None else None
-        pid, started = handshake.owner(self.pose)
-        peer = Peer("server", pid, started, self.pose, watch)
+    def await_bell(self, timeout: float | None = None) -> None:
+        """Wait until the doorbell rings for the last request, and read nothing: what a measurement waits for.
+
+        Raises:
+            Failure: the server left or ended, or took too long.
+        """
+        if self._waiter is None:
+            pid, started = handshake.owner(self.pose)
+            watch = self.process.watch if self.process is not None else None
+            self._waiter = Waiter(
+                self._reply, _REPLY_DOORBELL, Peer("server", pid, started, self.pose, watch)
+            )
+        self._waiter.deadline = self.timeout if timeout is None else timeout
         try:
-            Waiter(self._reply, _REPLY_DOORBELL, peer, timeout)(self.number - 1, self.steps, "a reply")
+            self._waiter(self.number - 1, self.steps, "a reply")
         except ProtocolError as error:
             found = error.how if isinstance(error, PeerLost) else str(error)
             raise Failure("the server", f"a reply to request {self.number}", found) from error

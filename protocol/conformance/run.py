@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 
+import numpy as np
+
 from protocol.conformance.rig import Rig
 from protocol.conformance.rule import Failure, Outcome, Result, Rule, Skip
 
@@ -20,7 +22,7 @@ def run_rule(rule: Rule, command: str, transport: str = "shm", timeout: float = 
     """
     began = time.perf_counter()
     outcome, details, last_words = Outcome.PASSED, "", ""
-    with Rig(command, transport, timeout) as rig:
+    with np.errstate(all="ignore"), Rig(command, transport, timeout) as rig:  # a peer may answer anything
         try:
             details = rule.check(rig) or ""
         except Skip as skip:

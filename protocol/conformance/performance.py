@@ -1,0 +1,179 @@
+"""Rules of speed: ratios within one run alone, since no machine is like another."""
+
+from __future__ import annotations
+
+import os
+import socket
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+from protocol import handshake
+from protocol.conformance.rig import Rig
+from protocol.conformance.rule import Failure, Level, Skip, demand, server_rule
+from protocol.conformance.sound import commands, done, fly, resets
+from protocol.layout import Op
+
+SLEEPLESS: Final = 20.0
+"""How many times the round trip of loopback UDP a step of one inner step may take."""
+IDLE_SHARE: Final = 0.15
+"""Share of a core that an idle server may burn."""
+PAUSE_S: Final = 1.0
+_SAMPLES: Final = 2000
+_ROUNDS: Final = 4
+_WARM: Final = 50
+_ECHO_DEADLINE_S: Final = 5.0
+
+_ECHO: Final = """
+import socket
+s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+s.bind(("127.0.0.1", 0))
+s.settimeout(30)
+print(s.getsockname()[1], flush=True)
+while True:
+    data, peer = s.recvfrom(256)
+    s.sendto(data, peer)
+"""
+"""A process that sends every datagram back, and ends half a minute after the last one."""
+
+
+@contextmanager
+def _udp_echo() -> Iterator[Callable[[], None]]:
+    """One round trip by loopback UDP to another process, of a command row and back; ends the process at the end."""
+    command = [sys.executable, "-I", "-S", "-c", _ECHO]
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line,
+    ):
+        try:
+            assert process.stdout is not None
+            line.connect(("127.0.0.1", int(process.stdout.readline())))
+            line.settimeout(_ECHO_DEADLINE_S)
+
+            def exchange() -> None:
+                line.send(bytes(64))
+                line.recv(256)
+
+            yield exchange
+        finally:
+            process.kill()
+
+
+def _times(exchange: Callable[[], object], count: int) -> list[float]:
+    """How long each of `count` exchanges takes (us)."""
+    times = []
+    for _ in range(count):
+        began = time.perf_counter_ns()
+        exchange()
+        times.append((time.perf_counter_ns() - began) / 1e3)
+    return times
+
+
+def _stepping(rig: Rig, lanes: int = 1) -> Callable[[], None]:
+    """Open a session whose steps take one inner step, and return what takes one."""
+    agent = rig.open(lanes=lanes, dt=0.01, inner_steps=1)
+    done(agent.reset(resets(agent)), "a reset")
+    agent.put_commands(commands(agent))
+
+    def step() -> None:
+        agent.request(Op.STEP)
+        agent.await_bell()
+        agent.steps += 1
+
+    _times(step, _WARM)
+    return step
+
+
+def _in_turn(exchanges: list[Callable[[], None]], samples: int) -> list[list[float]]:
+    """Measure several exchanges in turn, so that all of them meet the same machine."""
+    times: list[list[float]] = [[] for _ in exchanges]
+    for _ in range(_ROUNDS):
+        for found, exchange in zip(times, exchanges, strict=True):
+            found += _times(exchange, samples // _ROUNDS)
+    return times
+
+
+def _in_words(times: list[float]) -> str:
+    """Write p50, p99 and p99.9."""
+    ordered = sorted(times)
+    quantiles = (ordered[min(len(ordered) - 1, int(share * len(ordered)))] for share in (0.5, 0.99, 0.999))
+    return " / ".join(f"{quantile:.1f}" for quantile in quantiles)
+
+
+@server_rule(
+    "latency", Level.PERFORMANCE, "10", "latency of a step, one lane and one inner step", required=False
+)
+def latency(rig: Rig) -> str:
+    """Information, beside loopback UDP in the same run."""
+    with _udp_echo() as echo:
+        ours, udp = _in_turn([_stepping(rig), echo], _SAMPLES)
+    ratio = statistics.median(ours) / statistics.median(udp)
+    return (
+        f"p50 / p99 / p99.9 {_in_words(ours)} us, loopback UDP {_in_words(udp)} us in the same run; "
+        f"ratio of the medians {ratio:.2f}"
+    )
+
+
+@server_rule(
+    "no-sleep-in-step",
+    Level.PERFORMANCE,
+    "10",
+    f"no sleep in the step path: p50 of a step below {SLEEPLESS:g} times that of loopback UDP",
+)
+def no_sleep_in_step(rig: Rig) -> str:
+    """One lane, one inner step, in the same run."""
+    with _udp_echo() as echo:
+        ours, udp = (statistics.median(times) for times in _in_turn([_stepping(rig), echo], _SAMPLES // 4))
+    demand(ours < SLEEPLESS * udp, "p50 of a step", f"below {SLEEPLESS * udp:.0f} us", f"{ours:.0f} us")
+    return f"{ours / udp:.2f} times UDP"
+
+
+@server_rule(
+    "idle-cpu", Level.PERFORMANCE, "10", f"an idle server burns less than {IDLE_SHARE:.0%} of a core"
+)
+def idle_cpu(rig: Rig) -> str:
+    """While the agent pauses for a second; and it takes the next step."""
+    agent = rig.open()
+    done(agent.reset(resets(agent)), "a reset")
+    fly(agent, commands(agent), 1)
+    pid, _ = handshake.owner(agent.pose)
+    if not Path(f"/proc/{pid}/stat").exists():
+        raise Skip("this system has no /proc that tells a process's time")
+    time.sleep(0.1)  # it may look closely for a while
+    began, burnt = time.perf_counter(), _cpu_seconds(pid)
+    time.sleep(PAUSE_S)
+    share = (_cpu_seconds(pid) - burnt) / (time.perf_counter() - began)
+    demand(share < IDLE_SHARE, "share of a core while idle", f"below {IDLE_SHARE:.0%}", f"{share:.0%}")
+    fly(agent, commands(agent), 1)
+    return f"{share:.0%}"
+
+
+def _cpu_seconds(pid: int) -> float:
+    """User and system time of a process so far (s)."""
+    with suppress(OSError):
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / float(os.sysconf("SC_CLK_TCK"))
+    raise Failure("the server", "alive while the agent pauses", "it ended")
+
+
+@server_rule("long-pause", Level.PERFORMANCE, "10", f"a pause of the agent of {2 * PAUSE_S:g} s ends nothing")
+def long_pause(rig: Rig) -> None:
+    """Before the first request, and between two steps."""
+    agent = rig.open()
+    time.sleep(PAUSE_S)
+    done(agent.reset(resets(agent)), "a reset after a pause")
+    time.sleep(PAUSE_S)
+    fly(agent, commands(agent), 2)
+
+
+@server_rule("lanes-cost", Level.PERFORMANCE, "10", "a step of 64 lanes costs less than 64 steps of one")
+def lanes_cost(rig: Rig) -> str:
+    """By the medians, measured in turn."""
+    one, many = (statistics.median(times) for times in _in_turn([_stepping(rig), _stepping(rig, 64)], 200))
+    demand(many < 64 * one, "p50 of a step of 64 lanes", f"below {64 * one:.0f} us", f"{many:.0f} us")
+    return f"{many / one:.1f} times a step of one lane"
