@@ -53,6 +53,15 @@ class FlightStep:
 
 
 @dataclass(frozen=True)
+class FlownBefore:
+    """The first K control steps of a flight that was flown before, which are sent again as they were."""
+
+    commands: Floats  # (K, N, 8)
+    """Command blocks as they crossed the protocol."""
+    actions: Ints  # (K, N)
+
+
+@dataclass(frozen=True)
 class FlightResult:
     """How a flight of N lanes went."""
 
@@ -91,6 +100,7 @@ def fly(
     clearance_contact: bool = False,
     on_contact: OnContact = "end",
     step_limit: int | None = None,
+    before: FlownBefore | None = None,
     on_step: Callable[[FlightStep], bool | None] | None = None,
 ) -> FlightResult:
     """Fly every lane from its start until each episode is over.
@@ -110,6 +120,8 @@ def fly(
         clearance_contact: whether contact is known from the clearance rather than from physics.
         on_contact: "end" or "continue", see `TubeTask`.
         step_limit: control steps until a time-out, None for the limit of each tube.
+        before: control steps to send again before the controller flies; it looks on meanwhile, so that it knows
+            what it would know, and what it would have done is dropped.
         on_step: called after the reset and for each control step; returning True ends the flight after the
             step that is under way, which is the last that it sees.
 
@@ -128,7 +140,7 @@ def fly(
     resets = build_resets(
         session.description, geometry, settings, seeds, tube=tube, parameters=parameters, drawn=drawn
     )
-    loop = _Loop(session, task, controller, on_step)
+    loop = _Loop(session, task, controller, before, on_step)
     loop.begin(resets, drawn)
     started = time.perf_counter_ns()
     while loop.goes_on():
@@ -144,6 +156,7 @@ class _Loop:
         session: an open session.
         task: of the flight.
         controller: who flies.
+        before: as for `fly`.
         on_step: as for `fly`.
     """
 
@@ -152,6 +165,7 @@ class _Loop:
         session: AgentSession,
         task: TubeTask,
         controller: Controller,
+        before: FlownBefore | None,
         on_step: Callable[[FlightStep], bool | None] | None,
     ) -> None:
         self._session, self._task, self._controller, self._on_step = session, task, controller, on_step
@@ -161,6 +175,7 @@ class _Loop:
         self._actions: Ints = np.full(task.lanes, CONTINUOUS, dtype=np.int64)
         self._totals: Ints = np.zeros(len(PHASES), dtype=np.int64)
         self._entropy: Floats | float = np.nan
+        self._before, self._known = before, 0 if before is None else len(before.commands)
         self._stopped = False
         self._over = 0
         self._step: FlightStep
@@ -192,6 +207,8 @@ class _Loop:
         if self._over:  # whatever is still on its way to them, or blows there
             sent.speed[step.task.outcome != int(Outcome.RUNNING)] = 0.0
         self._entropy = self._controller.entropy
+        if step.index < self._known:
+            self._send_again(sent, step.index)
         decided = clock()
         poses = self._session.step(sent, self.report)
         answered = clock()
@@ -211,6 +228,13 @@ class _Loop:
         step.command[:] = sent.raw
         step.actions[:] = self._actions
         step.entropy[:] = self._entropy
+
+    def _send_again(self, sent: CommandBatch, index: int) -> None:
+        """Put what was flown before in place of what the controller would do now."""
+        assert self._before is not None
+        sent.raw[:] = self._before.commands[index]
+        self._actions[:] = self._before.actions[index]
+        self._entropy = np.nan
 
     def report(self) -> None:
         """Show the last step to `on_step`."""

@@ -18,6 +18,7 @@ from cosim.named_settings import SettingsCommand, take_settings
 from cosim.options import FlightOptions, evaluate_options, flight_options
 
 EXIT_NO_SUCCESS: Final = 1
+EXIT_FAILED_CHECK: Final = 1
 
 _COUNT: Final = click.IntRange(min=1)
 _SEED: Final = click.IntRange(0, 2**31)
@@ -50,8 +51,8 @@ def launch(require_success: bool, as_json: bool, **options: Any) -> None:
     from cosim.launch import launch as run
 
     settings = take_settings(options)
-    success = run(FlightOptions(settings=settings, **options), as_json=as_json)
-    if require_success and not success:
+    report = run(FlightOptions(settings=settings, **options), as_json=as_json)
+    if require_success and report["outcome"] != "success":
         sys.exit(EXIT_NO_SUCCESS)
 
 
@@ -68,6 +69,56 @@ def export(run: Path, kind: str, output: Path | None) -> None:
     from cosim.export import export as write
 
     click.echo(write(run, kind, output))
+
+
+@cosim.command(short_help="Check a recorded run, and replay its commands through fresh physics.")
+@click.argument("run", type=click.Path(path_type=Path))
+@click.option("--mesh", type=click.Path(path_type=Path), metavar="PATH", help="Where its tube is now.")
+@click.option(
+    "--server", metavar="COMMAND", help="Physics process, the rendezvous appended [default: the run's]."
+)
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, nothing else.")
+def verify(run: Path, mesh: Path | None, server: str | None, as_json: bool) -> None:
+    """Check that a run is whole, and that a fresh physics process makes the same poses of its commands, bit for bit.
+
+    Exits 1 and names step and quantity where the data, the mesh or the policy were changed or the poses differ.
+    Versions of software that differ are named, and fail only by what they do to the poses.
+
+    \b
+    cosim verify runs/2026-...
+    """
+    from cosim.verify import verify as run_verification
+
+    if not run_verification(run, mesh=mesh, server=server, as_json=as_json):
+        sys.exit(EXIT_NO_SUCCESS)
+
+
+@cosim.command(short_help="Let another policy fly on from a step of a recorded run.")
+@click.argument("run", type=click.Path(path_type=Path))
+@click.option("--policy", required=True, metavar="PATH|pure-pursuit|lidar-rule", help="Who flies on.")
+@click.option(
+    "--from-step", type=click.IntRange(min=0), required=True, metavar="K", help="The last step of the run."
+)
+@click.option(
+    "--server", metavar="COMMAND", help="Physics process, the rendezvous appended [default: the run's]."
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [default: a new one in runs/]."
+)
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, nothing else.")
+def replay(
+    run: Path, policy: str, from_step: int, server: str | None, out: Path | None, as_json: bool
+) -> None:
+    """Rebuild the state at step K of a run by sending its commands again, then let another policy fly on.
+
+    Both flights are the same up to K, bit for bit, which is checked; the table compares what came after.
+
+    \b
+    cosim replay runs/2026-... --policy pure-pursuit --from-step 120
+    """
+    from cosim.replay import replay as run_replay
+
+    run_replay(run, policy=policy, from_step=from_step, server=server, out=out, as_json=as_json)
 
 
 @cosim.command(short_help="Train a policy.")
@@ -251,6 +302,25 @@ def watch(as_json: bool, **options: Any) -> None:
 
     if not run(WatchOptions(**options), as_json=as_json):
         sys.exit(PEER)
+
+
+@cosim.command(short_help="Say what this machine has and lacks, and what dead sessions left on it.")
+@click.option(
+    "--clean", is_flag=True, help="Remove segments of sessions proved dead, and forgotten scratch folders."
+)
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, nothing else.")
+def doctor(clean: bool, as_json: bool) -> None:
+    """Look at Python, libraries, shared memory, leftovers, cores, clock and optional programs, with what to do.
+
+    Exit status 1 where something failed; warnings are about what is optional.
+
+    \b
+    cosim doctor --clean
+    """
+    from cosim.doctor import doctor as run
+
+    if not run(clean=clean, as_json=as_json):
+        sys.exit(EXIT_FAILED_CHECK)
 
 
 def _interrupted(number: int, _frame: FrameType | None) -> None:

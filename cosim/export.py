@@ -13,12 +13,10 @@ from numpy.typing import NDArray
 
 from cosim.errors import CosimError, OutputError
 from cosim.recording import LOG, MANIFEST, Column
-from cosim.runs import Run, read_run
+from cosim.runs import Run, element_names, read_run
 
 CHUNK: Final = 8192
 """Records that are in memory at a time."""
-
-AXES: Final = ("x", "y", "z")
 
 
 def export(folder: Path, kind: str, output: Path | None = None) -> Path:
@@ -45,15 +43,6 @@ def export(folder: Path, kind: str, output: Path | None = None) -> Path:
     finally:
         partial.unlink(missing_ok=True)
     return target
-
-
-def element_names(column: Column) -> list[str]:
-    """Names of the scalar columns that a field becomes: `position_x`, `lidar_17`."""
-    if not column.shape:
-        return [column.name]
-    size = int(np.prod(column.shape))
-    labels = column.labels or (AXES if size == len(AXES) else tuple(str(i) for i in range(size)))
-    return [f"{column.name}_{label}" for label in labels]
 
 
 def _chunks(run: Run) -> Iterator[NDArray[np.void]]:

@@ -16,12 +16,12 @@ import click
 
 from agent_client.conditions import NAMES
 from agent_client.episodes import Records, episode_dtype
-from agent_client.flight import FlightResult, FlightStep, fly
+from agent_client.flight import FlightResult, FlightStep, FlownBefore, fly
 from agent_client.settings import max_steps
 from agent_client.start import build_resets
 from agent_client.task import Outcome
 from cosim import __version__
-from cosim.errors import Terminated
+from cosim.errors import RunError, Terminated
 from cosim.folders import check_folder, new_folder
 from cosim.inputs import (
     TUBE_FILES,
@@ -63,11 +63,37 @@ class Flight:
     folder: Path
 
 
-def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
-    """Fly once, say what happened, and return whether the outcome is success.
+@dataclass(frozen=True)
+class Continuation:
+    """The beginning of a recorded run, from which another flight goes on."""
+
+    run: Path
+    before: FlownBefore
+    trajectory_hash: str
+    """Of the run up to and with the last of these steps, which must be reached again."""
+
+    def check(self, step: int, trajectory_hash: str) -> None:
+        """Compare the hash once the last of the steps is flown again.
+
+        Raises:
+            RunError: physics made other poses of the same commands.
+        """
+        if step == len(self.before.commands) and trajectory_hash != self.trajectory_hash:
+            raise RunError(
+                f"{self.run}: expected trajectory {self.trajectory_hash[:16]}… at step {step}, found "
+                f"{trajectory_hash[:16]}…: physics did not make the same poses of the same commands; "
+                f"`cosim verify {self.run}` names the first that differs"
+            )
+
+
+def launch(
+    options: FlightOptions, *, as_json: bool = False, after: Continuation | None = None
+) -> dict[str, Any]:
+    """Fly once, say what happened, and return the report that --json prints.
 
     The physics process starts up while the tube is read; bad input ends it and leaves nothing behind. With
-    `as_json` stdout holds one JSON object and everything else goes to stderr.
+    `as_json` stdout holds one JSON object and everything else goes to stderr. With `after` the
+    flight goes on from a recorded one.
 
     Raises:
         CosimError, MeshError, AgentError, SessionError: bad input.
@@ -112,12 +138,14 @@ def launch(options: FlightOptions, *, as_json: bool = False) -> bool:
             say(
                 "the physics side has no walls: contact is judged from the clearance, and nothing stops the drone"
             )
-        report = _fly_recorded(Flight(options, conduit, pilot, conditions, session, rendezvous, folder))
+        report = _fly_recorded(
+            Flight(options, conduit, pilot, conditions, session, rendezvous, folder), after
+        )
     if as_json:
         click.echo(json.dumps(report))
     else:
         _summarise(report, pilot, conduit, say)
-    return bool(report["outcome"] == _word(Outcome.SUCCESS))
+    return report
 
 
 def _chosen_for_the_user(mesh: Path | None, choice: PilotChoice) -> Iterator[str]:
@@ -142,7 +170,7 @@ def _forget_unflown(folder: Path) -> None:
             (folder / name).unlink(missing_ok=True)
 
 
-def _fly_recorded(flight: Flight) -> dict[str, Any]:
+def _fly_recorded(flight: Flight, after: Continuation | None) -> dict[str, Any]:
     """Fly with a recording that is closed whatever happens, and return the report."""
     options, pilot, session, folder = flight.options, flight.pilot, flight.session, flight.folder
     names = [parameter.name for parameter in PARAMETERS]
@@ -160,12 +188,13 @@ def _fly_recorded(flight: Flight) -> dict[str, Any]:
     )
     chosen = dict(zip(names, resets.parameters[0, : len(names)].tolist(), strict=True))
     manifest = _manifest(flight, drawn, defaults, chosen) | {"reset": _reset_described(resets)}
+    manifest["continues"] = None if after is None else _continuation_described(after)
     recorder = Recorder(folder, manifest, episode_dtype(pilot.settings.lidar.rays))
     status, report = "failed", dict[str, Any]()
     try:
         with LiveLine() as live:
             session.register_tube(TUBE, flight.conduit.reference)
-            observer = _Observer(recorder, live, options.realtime, pilot)
+            observer = _Observer(recorder, live, options.realtime, pilot, after)
             result = fly(
                 session,
                 geometry,
@@ -178,6 +207,7 @@ def _fly_recorded(flight: Flight) -> dict[str, Any]:
                 clearance_contact=not session.description.walls,
                 on_contact="end" if options.on_contact == "end" else "continue",
                 step_limit=options.max_steps,
+                before=None if after is None else after.before,
                 on_step=observer,
             )
         status, report = "completed", _report(result, recorder, pilot, observer)
@@ -193,8 +223,15 @@ def _fly_recorded(flight: Flight) -> dict[str, Any]:
 class _Observer:
     """Sees every step of the flight: records it, draws the live line, keeps the pace."""
 
-    def __init__(self, recorder: Recorder, live: LiveLine, realtime: float | None, pilot: Pilot) -> None:
-        self._recorder, self._live, self._realtime = recorder, live, realtime
+    def __init__(
+        self,
+        recorder: Recorder,
+        live: LiveLine,
+        realtime: float | None,
+        pilot: Pilot,
+        after: Continuation | None,
+    ) -> None:
+        self._recorder, self._live, self._realtime, self._after = recorder, live, realtime, after
         self._body_radius = pilot.settings.drone.body_radius
         self._dt = pilot.dt
         self.started = 0.0
@@ -203,6 +240,8 @@ class _Observer:
 
     def __call__(self, step: FlightStep) -> None:
         self._recorder.write(step)
+        if self._after is not None:
+            self._after.check(step.index, self._recorder.trajectory_hash)
         if step.index == 0:
             self.started = time.monotonic()
             self.startup_s = process_age()
@@ -270,6 +309,14 @@ def _reset_described(resets: ResetBatch) -> dict[str, Any]:
     """What a lane was reset to, beside the parameters: whoever flies it again asks for the same bits."""
     state = ("position", "quaternion", "linear_velocity", "angular_velocity")
     return {name: getattr(resets, name)[0].tolist() for name in state} | {"seed": int(resets.seed[0])}
+
+
+def _continuation_described(after: Continuation) -> dict[str, Any]:
+    return {
+        "run": str(after.run.resolve()),
+        "from_step": len(after.before.commands),
+        "trajectory_hash": after.trajectory_hash,
+    }
 
 
 def _manifest(

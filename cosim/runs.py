@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import RunError
 from cosim.recording import FORMAT, MANIFEST, Column, record_dtype
+
+AXES: Final = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
@@ -56,3 +58,12 @@ def read_run(folder: Path) -> Run:
     except OSError as error:
         raise RunError(f"{log}: expected the log of a run, found none ({error.strerror})") from error
     return Run(folder, manifest, columns, records)
+
+
+def element_names(column: Column) -> list[str]:
+    """Names of the scalar columns that a field becomes: `position_x`, `lidar_17`."""
+    if not column.shape:
+        return [column.name]
+    size = int(np.prod(column.shape))
+    labels = column.labels or (AXES if size == len(AXES) else tuple(str(i) for i in range(size)))
+    return [f"{column.name}_{label}" for label in labels]
