@@ -37,7 +37,7 @@ FAULT_STATES: Final = [state for state, moves in TRANSITIONS.items() if Event.LO
 UNDER_WAY: Final = {
     state: Op(event)
     for event, state in TRANSITIONS[State.READY].items()
-    if TURN[state] is Side.PHYSICS and event in tuple(Op)
+    if TURN[state] is Side.PHYSICS and event.value in {op.value for op in Op}
 }
 """The states in which a request is under way, with its op."""
 

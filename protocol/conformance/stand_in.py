@@ -66,3 +66,10 @@ class StandIn:
             if pipe is not None:
                 pipe.close()
         self._process.wait(PATIENCE_S)
+
+
+def dead_process() -> tuple[int, int]:
+    """Pid and start time of a process that is no more."""
+    stand_in = StandIn()
+    stand_in.close()
+    return stand_in.pid, stand_in.started
