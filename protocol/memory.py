@@ -67,12 +67,26 @@ def parse_rendezvous(text: str) -> Rendezvous:
         return Rendezvous(kind, stem)
     if kind == "file":
         path = Path(stem)
-        if not path.is_absolute() or not path.name:
+        if not path.is_absolute() or not path.name or not _may_be_a_path(stem):
             raise SessionError(f"rendezvous: expected file: and an absolute path, found {text!r}")
-        if not path.parent.is_dir():
+        if not _is_folder(path.parent):
             raise SessionError(f"rendezvous {text!r}: there is no folder {path.parent}; make it first")
         return Rendezvous(kind, stem)
     raise SessionError(f"rendezvous: expected shm:NAME or file:/path/stem, found {text!r}")
+
+
+def _may_be_a_path(text: str) -> bool:
+    try:
+        return b"\0" not in os.fsencode(text)
+    except UnicodeEncodeError:
+        return False
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except OSError:  # a name that is too long
+        return False
 
 
 class Segment:
@@ -257,13 +271,19 @@ def is_empty(rendezvous: Rendezvous, suffix: str) -> bool:
 
 def _map_file(name: str, path: Path, descriptor: int, size: int) -> Segment:
     mapping = mmap.mmap(descriptor, size)
-    return Segment(name, memoryview(mapping), path, descriptor, mapping.close)
+    return Segment(name, _whole_words(mapping), path, descriptor, mapping.close)
+
+
+def _whole_words(memory: mmap.mmap | memoryview) -> memoryview:
+    """View memory without a rest of less than a word at its end, which no segment has."""
+    with memoryview(memory) as view:
+        return view[: len(view) // 8 * 8]
 
 
 def _wrap_shared(name: str, shared: SharedMemory) -> Segment:
     """Put shared memory behind a Segment; its file, where the system shows one, serves locks and reservation."""
     assert shared.buf is not None  # it is None only after close()
-    view = memoryview(shared.buf)
+    view = _whole_words(shared.buf)
     if sys.platform == "win32":
         return Segment(name, view, None, _NO_DESCRIPTOR, shared.close)
     path = SHM_FOLDER / name

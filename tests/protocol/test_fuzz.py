@@ -1,0 +1,544 @@
+"""Any words in headers, requests and replies: a typed end, no hang, and nothing integrated that was not asked for.
+
+What is expected of each comes from an oracle that was written from the specification alone, section 7 above all.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from protocol import layout
+from protocol.agent import AgentSession, SessionSettings
+from protocol.errors import HandshakeError, PeerLost, PeerViolation, ProtocolError, Refusal, SessionError
+from protocol.handshake import Answer, magic, read_farewell, read_offer, write_answer
+from protocol.layout import COMMAND, HEADER, POSE, Field
+from protocol.memory import parse_rendezvous
+from protocol.opening import create_segments
+from protocol.physics import PhysicsSession
+from protocol.plant import CommandBatch, Plant, PlantDescription, PoseBatch, ResetBatch, TubeReference
+from protocol.toy import DEFAULTS, SPEED_MAX, ToyPlant
+
+LANES, TUBE_SLOTS = 2, 3
+SETTINGS = SessionSettings(LANES, 0.1, 0.025, TUBE_SLOTS)
+Start = Callable[..., subprocess.Popen[str]]
+
+
+def examples(count: int) -> Any:
+    """So many examples, the same ones in every run, none of them stored."""
+    return settings(
+        max_examples=count,
+        derandomize=True,
+        deadline=None,
+        database=None,
+        suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+    )
+
+
+integers = st.sampled_from(
+    [0, 1, 2, 3, 4, 5, -1, 2**31, 2**32 + 1, 2**62, 2**63 - 1, -(2**63)]
+) | st.integers(-(2**63), 2**63 - 1)
+tiny, huge = 5e-324, 1.7976931348623157e308
+floats = (
+    st.sampled_from([0.0, -0.0, 1.0, -1.0, 0.5, 0.1, 0.025, 0.05, tiny, -tiny, huge, -huge, 1e-300])
+    | st.sampled_from([math.nan, -math.nan, math.inf, -math.inf])
+    | st.floats()
+)
+words = (
+    st.binary(min_size=8, max_size=8)
+    | floats.map(lambda x: struct.pack("<d", x))
+    | integers.map(lambda x: x.to_bytes(8, "little", signed=True))
+)
+
+
+def put(view: memoryview, place: Field, word: bytes, at: int = 0) -> None:
+    """Write one word of a field, or as much of it as the field has."""
+    room = min(len(word), place.size - at)
+    view[place.offset + at : place.offset + at + room] = word[:room]
+
+
+def spoil(view: memoryview, changes: dict[str, bytes], fields: dict[str, Field]) -> None:
+    """Write words over fields by name."""
+    for name, word in changes.items():
+        put(view, fields[name], word)
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Headers
+
+
+def common_is_sound(view: memoryview, word: bytes, size: int) -> bool | None:
+    """Whether the specification takes the common part of a header; None where rounding decides."""
+    at = {place.name: place for place in HEADER}
+
+    def number(name: str) -> int:
+        return int(struct.unpack_from("<q", view, at[name].offset)[0])
+
+    dt, inner = struct.unpack_from("<2d", view, at["dt"].offset)
+    if not (bytes(view[:8]) == word and number("version_major") == 1 and 1 <= number("lanes") <= 65536):
+        return False
+    if not (0.0 < dt < math.inf and 0.0 < inner < math.inf and 1 <= number("inner_steps") <= 1_000_000):
+        return False
+    off = abs(number("inner_steps") * Fraction(inner) - Fraction(dt)) / Fraction(dt)
+    strides = [number(f"{name}_stride") for name in ("command", "pose", "reset")] == [64, 128, 384]
+    if not (strides and 1 <= number("tube_slots") <= 65536 and number("segment_bytes") == size):
+        return False
+    return None if abs(off - Fraction(1, 10**9)) < Fraction(1, 10**11) else off < Fraction(1, 10**9)
+
+
+header_words = st.dictionaries(st.sampled_from([place.name for place in HEADER]), words, max_size=3)
+
+
+@examples(1000)
+@given(header_words, st.sampled_from([0, 8, 4096]))
+def test_any_header_of_an_agent_is_taken_or_refused(changes: dict[str, bytes], more: int) -> None:
+    """Physics takes exactly the headers that the specification takes; of any other it writes no magic."""
+    command = memoryview(bytearray(layout.command_bytes(LANES) + more))
+    pose = memoryview(bytearray(layout.pose_bytes(LANES) + more))
+    AgentSession(command[: layout.command_bytes(LANES)], pose[: layout.pose_bytes(LANES)], SETTINGS)
+    spoil(command, changes, COMMAND)
+    lanes = layout.read_i64(command, COMMAND["lanes"])
+    sound = common_is_sound(command, b"TUBE.CMD", 6464 + 448 * lanes) and lanes <= LANES
+    try:
+        PhysicsSession(command.toreadonly(), pose, ToyPlant()).close()
+    except HandshakeError:
+        assert not sound
+        assert magic(pose) == bytes(8)
+    else:
+        assert sound in (True, None)
+        assert magic(pose) == b"TUBE.POS"
+
+
+@examples(1000)
+@given(
+    header_words
+    | st.dictionaries(
+        st.sampled_from(["speed_max", "walls", "defaults", "plant_name", "plant_engine"]), words
+    ),
+)
+def test_any_header_of_a_physics_side_is_taken_or_refused(changes: dict[str, bytes]) -> None:
+    """The agent takes exactly a header that echoes its own and has finite words."""
+    command = memoryview(bytearray(layout.command_bytes(LANES)))
+    pose = memoryview(bytearray(layout.pose_bytes(LANES)))
+    session = AgentSession(command, pose, SETTINGS)
+    write_answer(pose, read_offer(command), Answer(ToyPlant().describe(), 1, 2))
+    before = bytes(pose)
+    spoil(pose, changes, POSE)
+    free = {"version_minor", "pid", "start_time", "plant_name", "plant_engine"}
+    sound = all(
+        name in free or bytes(pose[POSE[name].bytes]) == before[POSE[name].bytes]
+        for name in changes
+        if name not in ("speed_max", "walls", "defaults")
+    )
+    speed_max, defaults = layout.read_f64(pose, POSE["speed_max"])[0], layout.read_f64(pose, POSE["defaults"])
+    sound = sound and 0.0 < speed_max < math.inf and all(map(math.isfinite, defaults))
+    sound = sound and layout.read_i64(pose, POSE["walls"]) in (0, 1)
+    try:
+        session.attached(lambda old, step, phase: old + 1)
+    except HandshakeError:
+        assert not sound
+    else:
+        assert sound
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Requests
+
+
+class CountingPlant(Plant):
+    """Moves nothing, and notes what it was asked for; its poses tell how many steps it made."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    def describe(self) -> PlantDescription:
+        """Say what the toy says."""
+        return ToyPlant().describe()
+
+    def open(self, lanes: int, dt: float, physics_dt: float, inner_steps: int) -> None:
+        """Nothing to prepare."""
+
+    def register_tube(self, index: int, tube: TubeReference) -> None:
+        """Note it."""
+        self.asked.append(f"register {index}")
+
+    def release_tube(self, index: int) -> None:
+        """Note it."""
+        self.asked.append(f"release {index}")
+
+    def reset(self, resets: ResetBatch, poses: PoseBatch) -> None:
+        """Note it; answer with the states that were asked for."""
+        chosen = resets.selected == 1
+        self.asked.append(f"reset {np.flatnonzero(chosen).tolist()}")
+        poses.raw[chosen, :13] = resets.raw[chosen, :13]
+        poses.step[chosen] = 0
+
+    def step(self, commands: CommandBatch, poses: PoseBatch) -> None:
+        """Note it and count."""
+        self.asked.append("step")
+        poses.step[:] += 1
+
+    def close(self) -> None:
+        """Nothing to give up."""
+
+
+def command_fault(row: bytes) -> int:
+    """Code of the first fault of a command row, 0 where there is none."""
+    x, y, z, speed, compensation = struct.unpack_from("<5d", row)
+    if not all(map(math.isfinite, (x, y, z))):
+        return 1
+    if abs(x * x + y * y + z * z - 1.0) > 1e-6:
+        return 3
+    for value, most in ((speed, SPEED_MAX), (compensation, 2.0)):
+        if not math.isfinite(value):
+            return 1
+        if not 0.0 <= value <= most:
+            return 2
+    return 4 if any(row[40:]) else 0
+
+
+POSITIVE, NOT_NEGATIVE = {0, 1, 2, 3, 4}, {5, 7, 8, 9, 10, 13, 17}
+
+
+def parameters_fault(values: tuple[float, ...], reserved: bytes) -> int:
+    """Code of the first fault of a reset's parameters, by the table of section 3."""
+    for word, value in enumerate(values):
+        if not math.isfinite(value):
+            return 1
+        low = value <= 0.0 if word in POSITIVE else value < 0.0 if word in NOT_NEGATIVE else False
+        if low or (word == 6 and value not in (0.0, 1.0)) or (word == 12 and not 0.0 <= value <= 1.0):
+            return 2
+    return 4 if any(reserved) else 0
+
+
+def reset_fault(row: bytes, tubes: set[int]) -> int:
+    """Code of the first fault of a reset row that is selected."""
+    state, (tube,) = struct.unpack_from("<13d", row), struct.unpack_from("<q", row, 104)
+    if not all(map(math.isfinite, state)):
+        return 1
+    if tube != -1 and tube not in tubes:
+        return 6
+    if not abs(sum(x * x for x in state[3:7]) - 1.0) <= 1e-6:
+        return 3
+    return parameters_fault(struct.unpack_from("<18d", row, 128), row[128 + 18 * 8 :])
+
+
+@dataclass
+class Oracle:
+    """What the specification says of a session so far."""
+
+    tubes: set[int] = field(default_factory=set)
+    lane_tubes: list[int | None] = field(default_factory=lambda: [None] * LANES)
+    steps: int = 0
+
+    def answer(self, op: int, command: memoryview) -> tuple[int, int]:
+        """Code (0 done) and lane of the answer that is due to a request whose words are in order."""
+        if op == 5:
+            return 0, -1
+        code, lane = {1: self._step, 2: self._reset, 3: self._register, 4: self._release}[op](command)
+        if code == 0:
+            self.steps += op == 1
+        return code, lane
+
+    def _step(self, command: memoryview) -> tuple[int, int]:
+        if None in self.lane_tubes:
+            return 5, self.lane_tubes.index(None)
+        rows = bytes(command[6464 : 6464 + 64 * LANES])
+        faults = [command_fault(rows[64 * lane :][:64]) for lane in range(LANES)]
+        return next(((code, lane) for lane, code in enumerate(faults) if code), (0, -1))
+
+    def _reset(self, command: memoryview) -> tuple[int, int]:
+        rows = bytes(command[6464 + 64 * LANES :])
+        chosen = {}
+        for lane in range(LANES):
+            row = rows[384 * lane :][:384]
+            (selected,) = struct.unpack_from("<q", row, 120)
+            code = 0 if selected == 0 else 2 if selected != 1 else reset_fault(row, self.tubes)
+            if code:
+                return code, lane
+            if selected:
+                chosen[lane] = struct.unpack_from("<q", row, 104)[0]
+        for lane, tube in chosen.items():
+            self.lane_tubes[lane] = tube
+        return 0, -1
+
+    def _register(self, command: memoryview) -> tuple[int, int]:
+        index, axes, scale = struct.unpack_from("<2qd", command, 2048)
+        (size,) = struct.unpack_from("<q", command, 2104)
+        if not 0 <= index < TUBE_SLOTS:
+            return 7, -1
+        if axes not in (0, 1):
+            return 9, -1
+        if not 0.0 < scale < math.inf:
+            return 2, -1
+        path = bytes(command[2112 : 2112 + size]) if 1 <= size <= 4096 else b"\0"
+        try:
+            path.decode()
+        except UnicodeDecodeError:
+            return 9, -1
+        if b"\0" in path:
+            return 9, -1
+        if index in self.tubes:
+            return 7, -1
+        self.tubes.add(index)
+        return 0, -1
+
+    def _release(self, command: memoryview) -> tuple[int, int]:
+        (index,) = struct.unpack_from("<q", command, 2048)
+        if not 0 <= index < TUBE_SLOTS:
+            return 7, -1
+        if index not in self.tubes:
+            return 6, -1
+        if index in self.lane_tubes:
+            return 8, self.lane_tubes.index(index)
+        self.tubes.discard(index)
+        return 0, -1
+
+
+payloads = st.dictionaries(
+    st.tuples(st.integers(0, LANES - 1), st.integers(0, 47)),
+    words
+    | st.just(bytes(8))
+    | st.integers(-1, TUBE_SLOTS).map(lambda x: x.to_bytes(8, "little", signed=True)),
+    max_size=3,
+)
+tube_words = st.tuples(
+    st.integers(-1, TUBE_SLOTS) | integers,
+    st.sampled_from([0, 0, 1, 2]) | integers,
+    st.sampled_from([1.0, 1.0, 0.001]) | floats,
+    st.sampled_from([None, None, None, 0, 4096, 4097]) | integers,
+    st.sampled_from([b"/a.obj", "/ü.obj".encode()]) | st.binary(min_size=1, max_size=12),
+)
+wrong_words = (
+    st.none()
+    | st.none()
+    | st.dictionaries(
+        st.sampled_from(["begin", "op", "step", "end", "doorbell"]), integers | st.integers(-2, 7), max_size=2
+    )
+)
+requests = st.lists(
+    st.tuples(st.sampled_from([1, 1, 1, 2, 2, 3, 4]), payloads, tube_words, wrong_words),
+    min_size=1,
+    max_size=10,
+)
+
+
+def sound_rows(command: memoryview) -> None:
+    """Write sound commands, and sound resets of all lanes."""
+    commands, resets = CommandBatch.zeros(LANES), ResetBatch.zeros(LANES)
+    commands.direction[:, 2], commands.compensation[:] = 1.0, 1.0
+    resets.selected[:], resets.parameters[:, : len(DEFAULTS)], resets.tube[:] = 1, DEFAULTS, -1
+    resets.quaternion[:, 3] = 1.0
+    command[layout.command_rows(LANES)] = commands.raw.tobytes()
+    command[layout.reset_rows(LANES)] = resets.raw.tobytes()
+
+
+def write_request(
+    command: memoryview,
+    number: int,
+    steps: int,
+    op: int,
+    payload: Any,
+    tube: Any,
+    wrong: dict[str, int] | None,
+) -> int:
+    """Write one request of the kind `requests` draws; its op, or 0 where its words are not those that are due."""
+    sound_rows(command)
+    for (lane, word), value in payload.items():
+        width, start = (64, 6464) if op == 1 else (384, 6464 + 64 * LANES)
+        at = start + width * lane + 8 * (word % (width // 8))
+        command[at : at + 8] = value
+    index, axes, scale, size, path = tube
+    struct.pack_into("<2qd", command, 2048, index, axes, scale)
+    struct.pack_into("<q4096s", command, 2104, len(path) if size is None else size, path)
+    words = {"begin": number, "op": op, "step": steps + (op == 1), "end": number, "doorbell": number}
+    words |= wrong or {}
+    for name, value in words.items():
+        layout.write_i64(command, COMMAND[name], value)
+    whole = all(words[name] == number for name in ("begin", "end", "doorbell"))
+    known = words["op"] in (1, 2, 3, 4, 5) and words["step"] == steps + (words["op"] == 1)
+    return words["op"] if whole and known else 0
+
+
+@examples(600)
+@given(requests)
+def test_any_sequence_of_requests_is_answered_as_specified(drawn: list[Any]) -> None:
+    """Done, refused by code and lane, or a violation, as is specified; refused and wrong ones move nothing."""
+    command = memoryview(bytearray(layout.command_bytes(LANES)))
+    pose = memoryview(bytearray(layout.pose_bytes(LANES)))
+    AgentSession(command, pose, SETTINGS)
+    plant, oracle = CountingPlant(), Oracle()
+    physics = PhysicsSession(command.toreadonly(), pose, plant)
+    for op, payload, tube, wrong in drawn:
+        number, asked, rows = physics.number + 1, list(plant.asked), bytes(pose[layout.pose_rows(LANES)])
+        published = write_request(command, number, oracle.steps, op, payload, tube, wrong)
+        if published == 0:
+            with pytest.raises(PeerViolation):
+                physics.answer(layout.read_i64(command, COMMAND["doorbell"]))
+            assert plant.asked == asked
+            assert bytes(pose[layout.pose_rows(LANES)]) == rows
+            assert layout.read_i64(pose, POSE["doorbell"]) == number - 1
+            return
+        code, lane = oracle.answer(published, command)
+        assert physics.answer(number) == (published != 5)
+        status, step = layout.read_i64(pose, POSE["status"]), layout.read_i64(pose, POSE["step"])
+        assert (status, step) == (int(code != 0), oracle.steps)
+        assert [layout.read_i64(pose, POSE[name]) for name in ("begin", "end", "doorbell")] == [number] * 3
+        if code:
+            found = [layout.read_i64(pose, POSE[name]) for name in ("refusal_code", "refusal_lane")]
+            assert found == [code, lane]
+            assert plant.asked == asked
+            assert bytes(pose[layout.pose_rows(LANES)]) == rows
+        else:
+            assert len(plant.asked) == len(asked) + (published != 5)
+        if published == 5:
+            return
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Replies
+
+
+reply_words = st.dictionaries(
+    st.sampled_from(["begin", "status", "step", "engine_ns", "end", "doorbell"]),
+    integers | st.integers(0, 4),
+    max_size=3,
+)
+texts = st.dictionaries(
+    st.sampled_from(["refusal_code", "refusal_lane", "refusal_field", "refusal_expected", "refusal_found"]),
+    st.binary(min_size=8, max_size=40),
+)
+
+
+@examples(600)
+@given(reply_words, texts, st.binary(min_size=64, max_size=256))
+def test_any_reply_is_taken_refused_or_a_violation(
+    changes: dict[str, int], refusal: dict[str, bytes], row: bytes
+) -> None:
+    """The agent counts a step only where every word is right; any text of a refusal can be told, any code is one."""
+    command = memoryview(bytearray(layout.command_bytes(LANES)))
+    pose = memoryview(bytearray(layout.pose_bytes(LANES)))
+    session = AgentSession(command, pose, SETTINGS)
+    write_answer(pose, read_offer(command), Answer(ToyPlant().describe(), 1, 0))
+    published: dict[str, int] = {}
+
+    def reply(old: int, step: int, phase: str) -> int:
+        published.update(
+            {"begin": 1, "status": 0, "step": 1, "engine_ns": 0, "end": 1, "doorbell": 1} | changes
+        )
+        for name, value in published.items():
+            layout.write_i64(pose, POSE[name], value)
+        spoil(pose, refusal, POSE)
+        put(pose, Field(layout.pose_rows(LANES).start, "poses", "bytes", 256, ""), row)
+        return layout.read_i64(pose, POSE["doorbell"])
+
+    session.attached(reply)
+    numbers = all(published_or(changes, name) == 1 for name in ("begin", "end", "doorbell"))
+    status, step = changes.get("status", 0), changes.get("step", 1)
+    commands = CommandBatch.zeros(LANES)
+    try:
+        poses = session.step(commands)
+    except Refusal:
+        assert numbers
+        assert (status, step, session.steps) == (1, 0, 0)
+    except PeerViolation:
+        assert not (numbers and (status, step) in ((0, 1), (1, 0)))
+        assert read_farewell(command)[0] == 3
+        assert session.steps == 0
+        with pytest.raises(SessionError):
+            session.step(commands)
+    else:
+        assert numbers
+        assert (status, step, session.steps) == (0, 1, 1)
+        assert poses.raw.tobytes() == bytes(pose[layout.pose_rows(LANES)])
+
+
+def published_or(changes: dict[str, int], name: str) -> int:
+    """A reply's word, 1 where it is the right one."""
+    return changes.get(name, 1)
+
+
+# ---------------------------------------------------------------------------------------------------------------
+# Names and processes
+
+
+@examples(300)
+@given(
+    st.sampled_from(["shm:", "file:", "file:/none/", "file:FOLDER/", ""]), st.text(max_size=90), st.booleans()
+)
+def test_any_text_for_a_rendezvous_is_taken_or_refused(
+    tmp_path: Path, name: str, kind: str, text: str, long: bool
+) -> None:
+    """Whatever is given as a rendezvous: a session is offered there and taken back, or a typed error says why not."""
+    place = (
+        kind.replace("FOLDER", str(tmp_path)) + (name if kind == "shm:" else "") + text + "x" * (5000 * long)
+    )
+    with suppress(SessionError):
+        AgentSession.offer(place, SETTINGS).close()
+
+
+@examples(5)
+@given(
+    st.dictionaries(st.sampled_from([place.name for place in HEADER]), words, min_size=1, max_size=3),
+    requests,
+)
+def test_a_server_process_ends_in_order_whatever_it_is_told(
+    tmp_path: Path, name: str, changes: dict[str, bytes], drawn: list[Any]
+) -> None:
+    """Another process that is given any header and any requests ends by itself, with a typed error and no trace."""
+    for spoilt in (changes, {}):
+        segments = create_segments(parse_rendezvous(f"shm:{name}"), LANES)
+        try:
+            said = _serve_by_hand(segments.command.view, segments.pose.view, f"shm:{name}", spoilt, drawn)
+        finally:
+            segments.unlink()
+            segments.close()
+        assert "Traceback" not in said
+        assert said == "" or said.split(":")[0] in {
+            error.__name__ for error in ProtocolError.__subclasses__()
+        }
+
+
+def _serve_by_hand(
+    command: memoryview, pose: memoryview, place: str, changes: dict[str, bytes], drawn: list[Any]
+) -> str:
+    """Offer a header, make requests until one is not answered, leave; what the server says of it all."""
+    peers = Path(__file__).with_name("peers.py")
+    server = subprocess.Popen(
+        [sys.executable, str(peers), "serve", place, os.devnull, "0.3"],
+        stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": str(peers.parents[2])},
+    )  # fmt: skip
+    try:
+        with AgentSession(command, pose, SETTINGS) as session:
+            spoil(command, changes, COMMAND)
+            try:
+                session.await_physics(lambda: None if server.poll() is None else "it ended", 20.0)
+            except ProtocolError:
+                drawn = []
+            for number, (op, payload, tube, wrong) in enumerate(drawn, 1):
+                write_request(command, number, layout.read_i64(pose, POSE["step"]), op, payload, tube, wrong)
+                rung = layout.read_i64(command, COMMAND["doorbell"])
+                try:
+                    session._wait(number - 1, 0, "fuzz")
+                except (PeerLost, SessionError):
+                    break
+                if rung != number:
+                    break
+        return str(server.communicate(timeout=20.0)[1])
+    finally:
+        server.kill()
+        server.communicate()
