@@ -103,7 +103,7 @@ def common_is_sound(view: memoryview, word: bytes, size: int) -> bool | None:
 header_words = st.dictionaries(st.sampled_from([place.name for place in HEADER]), words, max_size=3)
 
 
-@examples(1000)
+@examples(1500)
 @given(header_words, st.sampled_from([0, 8, 4096]))
 def test_any_header_of_an_agent_is_taken_or_refused(changes: dict[str, bytes], more: int) -> None:
     """Physics takes exactly the headers that the specification takes; of any other it writes no magic."""
@@ -123,7 +123,7 @@ def test_any_header_of_an_agent_is_taken_or_refused(changes: dict[str, bytes], m
         assert magic(pose) == b"TUBE.POS"
 
 
-@examples(1000)
+@examples(1500)
 @given(
     header_words
     | st.dictionaries(
@@ -374,7 +374,7 @@ def write_request(
     return words["op"] if whole and known else 0
 
 
-@examples(600)
+@examples(1000)
 @given(requests)
 def test_any_sequence_of_requests_is_answered_as_specified(drawn: list[Any]) -> None:
     """Done, refused by code and lane, or a violation, as is specified; refused and wrong ones move nothing."""
@@ -424,7 +424,7 @@ texts = st.dictionaries(
 )
 
 
-@examples(600)
+@examples(1000)
 @given(reply_words, texts, st.binary(min_size=64, max_size=256))
 def test_any_reply_is_taken_refused_or_a_violation(
     changes: dict[str, int], refusal: dict[str, bytes], row: bytes
@@ -489,6 +489,18 @@ def test_any_text_for_a_rendezvous_is_taken_or_refused(
     )
     with suppress(SessionError):
         AgentSession.offer(place, SETTINGS).close()
+
+
+def test_a_segment_whose_length_is_no_whole_number_of_words_is_served(tmp_path: Path, start: Start) -> None:
+    """A file that somebody made a little longer is mapped all the same; sizes come from the header."""
+    place = f"file:{tmp_path / 'odd'}"
+    with AgentSession.offer(place, SETTINGS) as session:
+        for segment in tmp_path.glob("odd.*"):
+            with segment.open("ab") as file:
+                file.write(b"\0\0\0")
+        server = start("serve", place)
+        session.await_physics(attach_timeout=20.0)
+    assert server.wait(20) == 0
 
 
 @examples(5)
