@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 import tempfile
 import time
@@ -30,6 +31,9 @@ LAST_WORDS_S: Final = 0.15
 """How long the survivor of a session is given to say what it saw; it looks every 30 ms."""
 ONCE_S: Final = 0.2
 """Time over which --once measures the rate of steps."""
+
+_NICE: Final = 19
+"""The system's lowest priority."""
 
 Figures = dict[str, Any]
 
@@ -58,6 +62,7 @@ def watch(options: WatchOptions, *, as_json: bool) -> bool:
         SessionError: there is no such session, or more than one and none was named.
         HandshakeError: what has that name is no session, or of another version.
     """
+    step_back()
     try:
         with _attach(options) as observer:
             if options.once:
@@ -65,6 +70,12 @@ def watch(options: WatchOptions, *, as_json: bool) -> bool:
             return _report_all(observer, options, as_json)
     except KeyboardInterrupt:
         return True
+
+
+def step_back() -> None:
+    """Leave the cores to whoever works: the session that is watched, above all."""
+    if hasattr(os, "nice"):
+        os.nice(_NICE)
 
 
 def _attach(options: WatchOptions) -> Observer:
@@ -171,7 +182,8 @@ def _lines(as_json: bool) -> Iterator[Callable[[Figures], None]]:
 
 
 def _say_line(figures: Figures, as_json: bool) -> None:
-    click.echo(json.dumps(figures) if as_json else "  ".join(_words(figures).values()))
+    words = (f"{name} {text}" for name, text in _words(figures).items())
+    click.echo(json.dumps(figures) if as_json else "  ".join(words))
 
 
 @contextmanager
@@ -195,22 +207,21 @@ def _draw(figures: Figures) -> Table:
 
 
 def _words(figures: Figures) -> dict[str, str]:
-    """The figures in words, by what they say."""
+    """The figures in words, by name."""
     words = {"session": figures["session"], "state": figures["state"]}
     for name in ("agent", "physics"):
         process = figures[name]
-        words[name] = f"{name} {process['pid']} {process['life']}" if process else f"no {name} yet"
+        words[name] = f"{process['pid']} {process['life']}" if process else "none yet"
     if figures["step"] is None:
         return words
-    rate = figures["steps_per_second"]
-    x, y, z = figures["position_m"]
-    contact = figures["contact_steps"]
-    lanes = "" if figures["lanes"] == 1 else f"lane 0 of {figures['lanes']}: "
+    rate, contact = figures["steps_per_second"], figures["contact_steps"]
+    if figures["lanes"] > 1:
+        words["lane"] = f"0 of {figures['lanes']}"
     return words | {
-        "step": f"step {figures['step']}" + ("" if rate is None else f", {rate:.0f}/s"),
-        "time": f"sim {figures['sim_time_s']:.2f} s",
-        "position": f"{lanes}position {x:.2f} {y:.2f} {z:.2f} m",
-        "speed": f"speed {figures['speed_m_s']:.2f} m/s",
-        "contact": f"contact in {contact} of {figures['inner_steps']}" if contact else "no contact",
-        "engine": f"engine {figures['engine_us']:.0f} us",
+        "step": f"{figures['step']}" + ("" if rate is None else f", {rate:.0f}/s"),
+        "time": f"{figures['sim_time_s']:.2f} s",
+        "position": "{:.2f} {:.2f} {:.2f} m".format(*figures["position_m"]),
+        "speed": f"{figures['speed_m_s']:.2f} m/s",
+        "contact": f"{contact} of {figures['inner_steps']} inner steps" if contact else "none",
+        "engine": f"{figures['engine_us']:.0f} us",
     }
