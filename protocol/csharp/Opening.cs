@@ -21,8 +21,8 @@ namespace TubeCosim
         {
             if (Opening.AgentIsDead(Command))
             {
+                Pose.RemoveAndDispose(); // first: a segment that stands alone is a .cmd, which tells whose it was
                 Command.RemoveAndDispose();
-                Pose.RemoveAndDispose();
             }
             else
             {
@@ -37,6 +37,7 @@ namespace TubeCosim
     {
         private const string CommandSuffix = ".cmd";
         private const string PoseSuffix = ".pose";
+        private const string Unfinished = "a header that is not finished";
         private const int HeaderBytes = 2048;
         private const long CreationGraceMs = 500;
 
@@ -59,7 +60,7 @@ namespace TubeCosim
             Segment command = Segment.Open(rendezvous, CommandSuffix, false), pose = null;
             if (command == null)
             {
-                unfinished.Reset();
+                LookForEmptySegment();
                 return null;
             }
             try
@@ -97,7 +98,7 @@ namespace TubeCosim
             if (!whole)
                 News = "a file too short for a segment";
             else if (!finished)
-                News = "a header that is not finished";
+                News = Unfinished;
             else if (AgentIsDead(command))
                 News = "stale segments of a dead agent";
             else if (command.Read(Layout.Command.Magic) == Layout.CommandMagic
@@ -110,11 +111,24 @@ namespace TubeCosim
             bool abandoned = unfinished.ElapsedMilliseconds >= CreationGraceMs || (finished && AgentIsDead(command));
             if (abandoned && command.Lock()) // an agent that is writing its header, or replacing these, holds it
             {
-                command.RemoveAndDispose();
                 if (pose != null)
                     pose.RemoveAndDispose();
+                command.RemoveAndDispose();
             }
             return false;
+        }
+
+        // A segment without a size is one that its agent has just made, or died over.
+        private void LookForEmptySegment()
+        {
+            bool empty = Segment.IsEmpty(rendezvous, CommandSuffix);
+            News = empty ? Unfinished : "nothing of that name";
+            if (!empty)
+                unfinished.Reset();
+            else if (unfinished.ElapsedMilliseconds < CreationGraceMs)
+                unfinished.Start();
+            else
+                Segment.RemoveEmpty(rendezvous, CommandSuffix);
         }
 
         private void Claim(Segment pose)

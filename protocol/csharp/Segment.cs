@@ -143,6 +143,32 @@ namespace TubeCosim
             return null;
         }
 
+        // Whether there is a segment that has not been given a size.
+        public static bool IsEmpty(Rendezvous rendezvous, string suffix)
+        {
+            FileInfo file = rendezvous.Named ? null : new FileInfo(rendezvous.Stem + suffix);
+            return file != null && file.Exists && file.Length == 0;
+        }
+
+        // Removes it, unless it has a size by now or somebody holds its lock.
+        public static void RemoveEmpty(Rendezvous rendezvous, string suffix)
+        {
+            string name = rendezvous.Stem + suffix;
+            try
+            {
+                using (FileStream file = new FileStream(name, FileMode.Open, FileAccess.ReadWrite, FileShare.ReadWrite))
+                {
+                    file.Lock(0, 1);
+                    if (file.Length == 0)
+                        File.Delete(name);
+                }
+            }
+            catch (IOException)
+            {
+                // gone, or held by an agent that is about to finish it; or Windows, where an open file stays
+            }
+        }
+
         // Claims the segment for this process until it is disposed or the process dies; false where it is taken.
         public bool Lock()
         {

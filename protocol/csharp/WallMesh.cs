@@ -50,6 +50,8 @@ namespace TubeCosim
                     for (string line = reader.ReadLine(); line != null; line = reader.ReadLine())
                     {
                         number++;
+                        while (line.EndsWith("\\", StringComparison.Ordinal)) // goes on in the next line
+                            line = line.Substring(0, line.Length - 1) + reader.ReadLine();
                         string[] words = line.Split(Blanks, StringSplitOptions.RemoveEmptyEntries);
                         if (words.Length > 0 && words[0] == "v")
                             vertices.Add(Vertex(words, tube));
