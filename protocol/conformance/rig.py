@@ -31,11 +31,14 @@ LEAVING_S: Final = 5.0
 """How long a peer may take to leave (section 2 of the specification)."""
 _LAST_LINES: Final = 12
 _LAST_BYTES: Final = 8192
+_LAST_WORDS_S: Final = 0.3
 _LOOK_S: Final = 0.002
 
 
 class PeerProcess:
     """A started `COMMAND RENDEZVOUS` in a process group of its own; what it prints goes to a file.
+
+    Where the command has `{}`, the rendezvous stands there and not at its end.
 
     Raises:
         Failure: the command cannot be run.
@@ -47,7 +50,7 @@ class PeerProcess:
         with output.open("ab") as printed:
             try:
                 self._process = subprocess.Popen(
-                    [*shlex.split(command), rendezvous],
+                    with_rendezvous(shlex.split(command), rendezvous),
                     env=environment,
                     stdin=subprocess.DEVNULL,
                     stdout=printed,
@@ -89,6 +92,13 @@ class PeerProcess:
             printed.seek(max(0, self._output.stat().st_size - _LAST_BYTES))
             text = printed.read().decode(errors="replace")
         return "\n".join(text.strip().splitlines()[-_LAST_LINES:])
+
+
+def with_rendezvous(words: list[str], rendezvous: str) -> list[str]:
+    """Put the rendezvous where a command has `{}`, or behind its last word."""
+    if not any("{}" in word for word in words):
+        return [*words, rendezvous]
+    return [word.replace("{}", rendezvous) for word in words]
 
 
 class Rig:
@@ -172,7 +182,9 @@ class Rig:
         return agent
 
     def last_words(self) -> str:
-        """What the peers printed, the end of it."""
+        """What the peers printed, the end of it; one that is about to end has a moment to finish."""
+        for process in self._processes:
+            process.wait(_LAST_WORDS_S)
         return "\n".join(filter(None, (process.last_words() for process in self._processes)))
 
 

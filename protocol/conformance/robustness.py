@@ -26,6 +26,7 @@ from protocol.conformance.scenes import (
     SETTLE_S,
     UNDER_WAY,
     Scene,
+    at_work,
     command_path,
     hand_over,
     ready,
@@ -33,10 +34,10 @@ from protocol.conformance.scenes import (
     scene,
     stop,
 )
-from protocol.conformance.sound import commands, resets
+from protocol.conformance.sound import resets
 from protocol.conformance.stand_in import StandIn
 from protocol.handshake import owner, write_farewell
-from protocol.layout import COMMAND, Farewell, read_i64
+from protocol.layout import Farewell
 from protocol.states import Event, State
 
 ROBUSTNESS: Final = Level.ROBUSTNESS
@@ -66,13 +67,21 @@ def _agent_killed(rig: Rig) -> str:
 
 
 @server_rule(
-    "agent-exits",
+    "agent-killed-at-work",
     ROBUSTNESS,
     "10",
-    "an agent that exits without goodbye or farewell is noticed as one that was killed is",
+    "an agent that dies while the engine works is noticed when it is done",
 )
-def _agent_exits(rig: Rig) -> str:
-    return _slowest({state: _dies(rig, state, StandIn.leave) for state in (State.READY, State.STEPPING)})
+def _agent_killed_at_work(rig: Rig) -> str:
+    with at_work(rig) as s:
+        demand(s.agent.get("doorbell") < s.agent.number, "the engine", "at work", "done")
+        s.stand_in.kill()
+        while s.agent.get("doorbell") < s.agent.number and segments_left(s.agent.rendezvous):
+            time.sleep(0.001)
+        since = time.monotonic()
+        _await_removal(s, _BOUND)
+        await_end(s.server, "after its agent died while the engine worked")
+        return f"noticed {(time.monotonic() - since) * 1e3:.0f} ms after the work"
 
 
 @server_rule("agent-zombie", ROBUSTNESS, "10", "an agent that is a zombie is dead")
@@ -267,109 +276,6 @@ def _await_leaving(s: Scene, since: float) -> None:
                 "neither",
             )
         time.sleep(0.001)
-
-
-# --- what was here before ---
-
-
-def _serves_next(rig: Rig, rendezvous: str, server: PeerProcess) -> None:
-    """Demand that a waiting server takes the next session at its rendezvous."""
-    agent = rig.agent(rendezvous=rendezvous)
-    agent.offer()
-    agent.attend(server)
-    agent.await_header()
-    agent.goodbye()
-    await_end(server, "after a goodbye")
-
-
-@server_rule(
-    "stale-segments-removed",
-    ROBUSTNESS,
-    "4",
-    "a starting server removes the segments of a dead agent and waits on",
-)
-def _stale_segments_removed(rig: Rig) -> None:
-    agent = rig.agent()
-    stand_in = hand_over(agent)
-    agent.offer(pid=stand_in.pid, start_time=stand_in.started)
-    stand_in.close()
-    server = rig.start()
-    await_no_segments(rig.rendezvous, rig.timeout)
-    agent.close()
-    _serves_next(rig, rig.rendezvous, server)
-
-
-@server_rule(
-    "abandoned-header-removed",
-    ROBUSTNESS,
-    "4",
-    "a header left without magic for half a second, its lock free, is removed by a starting server",
-)
-def _abandoned_header_removed(rig: Rig) -> None:
-    agent = rig.agent()
-    hand_over(agent).close()
-    server = rig.start()
-    await_no_segments(rig.rendezvous, rig.timeout)
-    agent.close()
-    _serves_next(rig, rig.rendezvous, server)
-
-
-@server_rule(
-    "second-server", ROBUSTNESS, "2", "a second server leaves without writing a byte, and the first serves on"
-)
-def _second_server(rig: Rig) -> None:
-    agent = rig.open()
-    agent.reset(resets(agent))
-    before = bytes(agent.pose)
-    second = rig.start()
-    await_end(second, "as a second client", rig.timeout)
-    demand(
-        bytes(agent.pose) == before, "the pose segment", "not a byte written by a second server", "it changed"
-    )
-    expect("status of a step by the first server", agent.step(commands(agent)).status, 0)
-
-
-@server_rule(
-    "served-session-left",
-    ROBUSTNESS,
-    "2",
-    "a session that another server has served or refused is left untouched",
-)
-def _served_session_left(rig: Rig) -> None:
-    for traces in ("magic", "farewell"):
-        agent = rig.agent(rendezvous=rig.new_rendezvous())
-        agent.offer()
-        if traces == "magic":
-            agent.pose[:8] = b"TUBE.POS"
-        else:
-            write_farewell(agent.pose, Farewell.FAILED, "its engine did not start")
-        before = bytes(agent.pose)
-        server = rig.start(agent.rendezvous)
-        await_end(server, f"since a {traces} stands in the pose segment", rig.timeout)
-        demand(
-            bytes(agent.pose) == before, f"a pose segment with a {traces}", "not a byte written", "it changed"
-        )
-        agent.close()
-
-
-@server_rule(
-    "died-before-magic-replaced",
-    ROBUSTNESS,
-    "2",
-    "a server that died before its magic stood is replaced by another",
-)
-def _died_before_magic_replaced(rig: Rig) -> None:
-    agent = rig.agent()
-    dead = StandIn()
-    for offset, value in ((COMMAND["pid"], dead.pid), (COMMAND["start_time"], dead.started)):
-        agent.pose[offset.bytes] = value.to_bytes(8, "little")
-    dead.close()
-    agent.offer()
-    agent.attend(rig.start())
-    agent.await_header()
-    demand(
-        read_i64(agent.pose, COMMAND["pid"]) != dead.pid, "pid of the header", "the new server's", dead.pid
-    )
 
 
 # --- told to stop ---

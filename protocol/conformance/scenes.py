@@ -6,6 +6,7 @@ made, and it goes on (SIGCONT) to find both. The agent is a stand-in process, so
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import time
@@ -17,11 +18,11 @@ from typing import Final
 
 from protocol.conformance.raw_agent import RawAgent
 from protocol.conformance.rig import PeerProcess, Rig, segments_left
-from protocol.conformance.rule import Failure, expect
+from protocol.conformance.rule import Failure, Skip, expect
 from protocol.conformance.sound import commands, resets
 from protocol.conformance.stand_in import StandIn
 from protocol.handshake import owner
-from protocol.layout import FAREWELL, Op
+from protocol.layout import FAREWELL, INNER_STEPS_MAX, Op
 from protocol.liveness import Life, life
 from protocol.states import TRANSITIONS, TURN, Event, Side, State
 
@@ -29,6 +30,8 @@ NOTICE_S: Final = 0.1
 """Within this time a side notices that the other is dead (section 10)."""
 ALLOWANCE_S: Final = 0.4
 """What a busy machine may add to it."""
+WORK_S: Final = 0.15
+"""How long a step lasts in which a server is caught at work."""
 SETTLE_S: Final = 0.15
 """How long nothing may happen where nothing should."""
 
@@ -88,9 +91,36 @@ def scene(rig: Rig, state: State) -> Iterator[Scene]:
         agent.close()
 
 
-def ready(rig: Rig, lanes: int = 1) -> tuple[RawAgent, PeerProcess, StandIn]:
-    """Open a session whose agent is a stand-in, with its lanes reset and a step done."""
-    agent = rig.agent(lanes, rendezvous=rig.new_rendezvous())
+@contextmanager
+def at_work(rig: Rig) -> Iterator[Scene]:
+    """Bring a session into STEPPING while its engine works, for about `WORK_S`; the server is not stopped.
+
+    Raises:
+        Skip: a step of the most inner steps is done at once.
+    """
+    inner_steps = 1000
+    agent, server, stand_in = ready(rig, inner_steps)
+    began = time.monotonic()
+    agent.step(commands(agent))
+    each = (time.monotonic() - began) / inner_steps
+    server.end()
+    stand_in.close()
+    if each * INNER_STEPS_MAX < WORK_S / 4:
+        raise Skip("the engine is too quick to be caught at work")
+    agent, server, stand_in = ready(rig, min(INNER_STEPS_MAX, math.ceil(WORK_S / each)))
+    ring(agent, Op.STEP)
+    time.sleep(WORK_S / 16)
+    try:
+        yield Scene(State.STEPPING, agent, server, stand_in, held=False)
+    finally:
+        server.end()
+        stand_in.close()
+        agent.close()
+
+
+def ready(rig: Rig, inner_steps: int = 4) -> tuple[RawAgent, PeerProcess, StandIn]:
+    """Open a session whose agent is a stand-in, with its lane reset and a step done."""
+    agent = rig.agent(inner_steps=inner_steps, rendezvous=rig.new_rendezvous())
     stand_in = hand_over(agent)
     agent.offer(pid=stand_in.pid, start_time=stand_in.started)
     server = rig.start(agent.rendezvous)

@@ -19,7 +19,8 @@ from protocol.errors import ProtocolError
 from protocol.plant import NO_TUBE, CommandBatch, ResetBatch, TubeReference
 
 STEPS: Final = 50
-SETTINGS: Final = {"dt": 0.02, "physics_dt": 0.005}
+DT: Final = 0.02
+PHYSICS_DT: Final = 0.005
 _TUBE: Final = 0
 
 
@@ -55,7 +56,7 @@ def main() -> int:
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, _stop)
     try:
-        with AgentSession.open(options.rendezvous, SessionSettings(options.lanes, **SETTINGS)) as session:
+        with AgentSession.open(options.rendezvous, SessionSettings(options.lanes, DT, PHYSICS_DT)) as session:
             fly(session, options.tube)
     except ProtocolError as error:
         sys.stderr.write(f"toy_agent: {type(error).__name__}: {error}\n")

@@ -14,6 +14,7 @@ from protocol.conformance.scenes import (
     SETTLE_S,
     UNDER_WAY,
     Scene,
+    at_work,
     ring,
     scene,
     without_farewell,
@@ -151,6 +152,20 @@ def _early_doorbell(rig: Rig) -> None:
         with scene(rig, state) as s:
             ring(s.agent, Op.STEP, step=s.agent.steps + 1)
             _ends(s, "an early request")
+
+
+@server_rule(
+    "early-at-work",
+    ROBUSTNESS,
+    "5",
+    "a next request begun or published while the engine works ends the session; the work is not published",
+)
+def _early_at_work(rig: Rig) -> None:
+    for word in ("begin", "doorbell"):
+        with at_work(rig) as s:
+            demand(s.agent.get("doorbell") < s.agent.number, "the engine", "at work", "done")
+            s.agent.put(**{word: s.agent.number + 1})
+            _ends(s, f"an early {word} at work")
 
 
 @server_rule(
