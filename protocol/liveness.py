@@ -30,7 +30,9 @@ def start_time(pid: int) -> int:
     creation time (100 ns since 1601); 0 where that is not known or there is no such process.
     """
     if sys.platform == "win32":
-        return _windows_process(pid)[1]
+        from protocol import windows
+
+        return windows.process(pid)[1]
     stat = _proc_stat(pid)
     return int(stat[_START_TIME]) if stat else UNKNOWN
 
@@ -43,8 +45,11 @@ def life(pid: int, started: int) -> Life:
     if pid <= 0:
         return Life.RUNNING
     if sys.platform == "win32":
-        alive, created = _windows_process(pid)
-        return Life.RUNNING if alive and started in (UNKNOWN, created) else Life.DEAD
+        from protocol import windows
+
+        alive, created = windows.process(pid)
+        same = UNKNOWN in (started, created) or started == created
+        return Life.RUNNING if alive and same else Life.DEAD
     if not _HAS_PROC:
         return Life.RUNNING if _exists(pid) else Life.DEAD
     stat = _proc_stat(pid)
@@ -108,26 +113,3 @@ def _exists(pid: int) -> bool:
     except PermissionError:  # it exists and is another user's
         return True
     return True
-
-
-if sys.platform == "win32":
-    import ctypes
-
-    _QUERY_LIMITED_INFORMATION: Final = 0x1000
-    _STILL_ACTIVE: Final = 259
-
-    def _windows_process(pid: int) -> tuple[bool, int]:
-        """Whether a process lives, and its creation time. (`os.kill(pid, 0)` would send it Ctrl-C there.)"""
-        kernel = ctypes.windll.kernel32
-        kernel.OpenProcess.restype = ctypes.c_void_p
-        handle = ctypes.c_void_p(kernel.OpenProcess(_QUERY_LIMITED_INFORMATION, False, pid))
-        if not handle:
-            return False, UNKNOWN
-        try:
-            code = ctypes.c_ulong()
-            times = [ctypes.c_ulonglong() for _ in range(4)]
-            kernel.GetExitCodeProcess(handle, ctypes.byref(code))
-            kernel.GetProcessTimes(handle, *(ctypes.byref(t) for t in times))
-            return code.value == _STILL_ACTIVE, times[0].value
-        finally:
-            kernel.CloseHandle(handle)

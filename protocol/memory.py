@@ -18,6 +18,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
@@ -102,6 +103,7 @@ class Segment:
         self._descriptor = descriptor
         self._unmap = unmap
         self._lock: SharedMemory | None = None
+        self._remove_when_closed = False
         self._claim: tuple[int, int, int] | None = None
 
     def lock(self) -> bool:
@@ -111,7 +113,9 @@ class Segment:
         the system itself releases it, so that a dead owner leaves no claim behind.
         """
         if sys.platform == "win32":
-            return self._lock_windows()
+            from protocol import windows
+
+            return self._reserve_name() if self.path is None else windows.lock_file(self._descriptor)
         import fcntl
 
         try:
@@ -123,34 +127,30 @@ class Segment:
         _claims.add(self._claim)
         return True
 
-    if sys.platform == "win32":
-
-        def _lock_windows(self) -> bool:
-            import msvcrt
-
-            try:
-                if self.path is None:
-                    self._lock = SharedMemory(f"{self.name}.lock", create=True, size=1)
-                else:
-                    os.lseek(self._descriptor, 0, os.SEEK_SET)
-                    msvcrt.locking(self._descriptor, msvcrt.LK_NBLCK, 1)
-            except OSError:
-                return False
-            return True
+    def _reserve_name(self) -> bool:
+        """Claim Windows' shared memory, which has no file to lock, by a name that goes with its owner."""
+        try:
+            self._lock = _shared_memory(f"{self.name}.lock", create=True, size=1)
+        except OSError:
+            return False
+        return True
 
     def unlink(self) -> None:
-        """Remove the segment's name, unless it is gone already or stands for a newer segment."""
-        if (
-            self.path is None or self._descriptor == _CLOSED
-        ):  # Windows removes shared memory with its last user
+        """Remove the segment's name, unless it is gone already or stands for a newer segment.
+
+        Windows removes shared memory with its last user, and keeps the name of a file until it is closed.
+        """
+        if self.path is None or self._descriptor == _CLOSED:
             return
         try:
-            if os.path.samestat(os.fstat(self._descriptor), self.path.stat()):
-                self.path.unlink()
+            if not os.path.samestat(os.fstat(self._descriptor), self.path.stat()):
+                return
         except FileNotFoundError:
-            pass
-        except PermissionError as error:  # Windows, while the other side still maps the file
-            _log.warning("%s stays behind: %s", self.path, error)
+            return
+        if sys.platform == "win32":
+            self._remove_when_closed = True
+        else:
+            self.path.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Unmap; every view of it must have been released before. Idempotent."""
@@ -165,6 +165,12 @@ class Segment:
         self._descriptor = _CLOSED
         if self._claim is not None:
             _claims.discard(self._claim)
+        if sys.platform == "win32" and self._remove_when_closed:
+            from protocol import windows
+
+            assert self.path is not None
+            if not windows.remove_file(self.path):
+                _log.warning("%s stays behind: another process still maps it", self.path)
 
 
 _NO_DESCRIPTOR: Final = -1
@@ -327,7 +333,9 @@ def _reserve(descriptor: int, size: int) -> None:
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(descriptor, 0, size)
     else:
-        os.write(descriptor, bytes(size))
+        rest = memoryview(bytes(size))
+        while rest:  # a disk that is nearly full takes a part of it first
+            rest = rest[os.write(descriptor, rest) :]
 
 
 def _why_not_created(name: str, rendezvous: Rendezvous, size: int, error: OSError) -> str:
@@ -343,30 +351,32 @@ def _why_not_created(name: str, rendezvous: Rendezvous, size: int, error: OSErro
     return f"no room for segment {name}: expected {size} free bytes in {folder}, found {free}; {advice}"
 
 
-def _find_fence() -> Callable[[], None] | None:
+def _find_fence() -> Callable[[], object] | None:
     """Return what keeps the processor from reordering stores, or None where it keeps their order by itself.
 
-    Raises:
-        SessionError: the processor may reorder, and the system's libraries have no fence that Python can call.
+    Where it may reorder and the libraries of the system have no fence, opening a session raises a SessionError.
     """
     if platform.machine().lower() in ("x86_64", "amd64", "i686", "i386", "x86"):
         return None
     import ctypes
 
     sequentially_consistent = 5  # memory_order_seq_cst of C11
+    library, name, arguments = {
+        "darwin": ("libSystem.dylib", "OSMemoryBarrier", ()),
+        "win32": ("kernel32.dll", "FlushProcessWriteBuffers", ()),
+    }.get(sys.platform, ("libatomic.so.1", "atomic_thread_fence", (sequentially_consistent,)))
     try:
-        library, name, arguments = (
-            ("libSystem.dylib", "OSMemoryBarrier", ())
-            if sys.platform == "darwin"
-            else ("libatomic.so.1", "atomic_thread_fence", (sequentially_consistent,))
+        return partial(getattr(ctypes.CDLL(library), name), *arguments)
+    except (OSError, AttributeError):
+        problem = (
+            f"this processor ({platform.machine()}) reorders stores and needs a fence: expected {name} in {library}, "
+            "found none; install that library (libatomic on Linux)"
         )
-        function = getattr(ctypes.CDLL(library), name)
-    except (OSError, AttributeError) as error:
-        raise SessionError(
-            f"this processor ({platform.machine()}) reorders stores and needs a fence: expected {name} "
-            f"in {library}, found none; install libatomic"
-        ) from error
-    return lambda: function(*arguments)
+
+    def missing() -> None:
+        raise SessionError(problem)
+
+    return missing
 
 
 FENCE: Final = _find_fence()
