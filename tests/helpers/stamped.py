@@ -1,13 +1,19 @@
-"""A session in which every word tells its step, so that a torn reading shows: `python stamped.py PART RENDEZVOUS LANES`.
+"""A session in which every word tells its step, so that a torn reading shows.
 
-`serve` answers each step with rows of which every word is the step; `fly` commands a direction, a speed and a
-compensation that follow from the step, as fast as it can, until it is killed or `STEPS` are flown.
+python stamped.py serve RENDEZVOUS                 answers each step with rows of which every word is the step
+python stamped.py fly RENDEZVOUS LANES [STEPS]     commands what follows from the step, as fast as it can, then
+                                                   says goodbye
 """
 
 from __future__ import annotations
 
 import math
+import os
+import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 
@@ -58,13 +64,26 @@ def fly(rendezvous: str, lanes: int, steps: int) -> None:
             assert np.all(poses.step == step)
 
 
+@contextmanager
+def part(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
+    """Play a part in a process of its own, which is killed at the end."""
+    command = [sys.executable, __file__, *map(str, arguments)]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
 def main() -> None:
     """Play the part that the command line names."""
-    part, rendezvous, lanes, *rest = sys.argv[1:]
-    if part == "serve":
+    role, rendezvous, *rest = sys.argv[1:]
+    if role == "serve":
         serve(rendezvous, StampPlant())
     else:
-        fly(rendezvous, int(lanes), int(rest[0]) if rest else sys.maxsize)
+        fly(rendezvous, int(rest[0]), int(rest[1]) if rest[1:] else sys.maxsize)
 
 
 if __name__ == "__main__":
