@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -28,7 +28,7 @@ from protocol.conformance.sound import (
 )
 from protocol.errors import RefusalCode
 from protocol.layout import Op
-from protocol.plant import PARAMETER_INDEX, PARAMETERS, CommandBatch, Parameter, ResetBatch
+from protocol.plant import PARAMETER_INDEX, PARAMETERS, RESET_WORDS, Floats, Parameter
 
 LANE: Final = 1
 """The lane at fault among three."""
@@ -36,6 +36,15 @@ _BARELY: Final = 0.9e-6
 _TOO_FAR: Final = 1.2e-6
 """How far a squared length is from 1, within and beyond the tolerance of 1e-6."""
 _NOT_NUMBERS: Final = (math.nan, math.inf, -math.inf)
+# Words of a command row.
+_SPEED: Final = 3
+_COMPENSATION: Final = 4
+_COMMAND_RESERVED: Final = (5, 6, 7)
+# Words of a reset row.
+_QUATERNION: Final = 3
+_TUBE: Final = 13
+_SELECTED: Final = 15
+_PARAMETERS: Final = 16
 _MINUS_ZERO: Final = struct.unpack("<q", struct.pack("<d", -0.0))[0]
 
 
@@ -46,20 +55,31 @@ def _ready(rig: Rig) -> RawAgent:
     return agent
 
 
-def _refused_step(
-    agent: RawAgent, what: str, code: RefusalCode, spoil: Callable[[CommandBatch], object]
-) -> None:
+Value = float | int | tuple[float, ...]
+"""What is written into a row: an f64, an i64, or several f64 from a word on."""
+
+
+def _refused_step(agent: RawAgent, what: str, code: RefusalCode, word: int, value: Value) -> None:
+    """Demand that a step is refused for one word of one command row."""
     batch = commands(agent)
-    spoil(batch)
-    refused(agent.step(batch), what, code, LANE)
+    _spoil(batch.raw, word, value)
+    refused(agent.step(batch), f"{what} = {value}", code, LANE)
 
 
-def _refused_reset(
-    agent: RawAgent, what: str, code: RefusalCode, spoil: Callable[[ResetBatch], object]
-) -> None:
+def _refused_reset(agent: RawAgent, what: str, code: RefusalCode, word: int, value: Value) -> None:
+    """Demand that a reset is refused for one word of one reset row."""
     batch = resets(agent)
-    spoil(batch)
-    refused(agent.reset(batch), what, code, LANE)
+    _spoil(batch.raw, word, value)
+    refused(agent.reset(batch), f"{what} = {value}", code, LANE)
+
+
+def _spoil(rows: Floats, word: int, value: Value) -> None:
+    if isinstance(value, int):
+        rows.view(np.int64)[LANE, word] = value
+    elif isinstance(value, tuple):
+        rows[LANE, word : word + len(value)] = value
+    else:
+        rows[LANE, word] = value
 
 
 @server_rule("refusal-not-finite-command", Level.CORE, "7", "code 1: NaN or infinity in a command row")
@@ -68,12 +88,7 @@ def refusal_not_finite_command(rig: Rig) -> None:
     agent = _ready(rig)
     for word, name in enumerate(("direction x", "direction y", "direction z", "speed", "compensation")):
         for value in _NOT_NUMBERS:
-            _refused_step(
-                agent,
-                f"{name} = {value}",
-                RefusalCode.NOT_FINITE,
-                lambda batch, word=word, value=value: batch.raw.__setitem__((LANE, word), value),
-            )
+            _refused_step(agent, name, RefusalCode.NOT_FINITE, word, value)
     fly(agent, commands(agent), 1)
 
 
@@ -81,14 +96,9 @@ def refusal_not_finite_command(rig: Rig) -> None:
 def refusal_not_finite_reset(rig: Rig) -> None:
     """Each number of the state and each parameter."""
     agent = _ready(rig)
-    for word in (*range(13), *(16 + index for index in range(len(PARAMETERS)))):
+    for word in (*range(_TUBE), *(_PARAMETERS + index for index in range(len(PARAMETERS)))):
         for value in (math.nan, -math.inf):
-            _refused_reset(
-                agent,
-                f"word {word} of a reset row = {value}",
-                RefusalCode.NOT_FINITE,
-                lambda batch, word=word, value=value: batch.raw.__setitem__((LANE, word), value),
-            )
+            _refused_reset(agent, f"word {word} of a reset row", RefusalCode.NOT_FINITE, word, value)
     done(agent.reset(resets(agent)), "a sound reset after the refusals")
 
 
@@ -105,9 +115,9 @@ def refusal_out_of_range_command(rig: Rig) -> None:
         fly(agent, commands(agent, compensation=compensation), 1)
     code = RefusalCode.OUT_OF_RANGE
     for speed in (-1e-300, math.nextafter(most, math.inf)):
-        _refused_step(agent, f"speed {speed!r}", code, lambda b, v=speed: b.speed.__setitem__(LANE, v))
-    for c in (-1e-300, math.nextafter(2.0, math.inf)):
-        _refused_step(agent, f"compensation {c!r}", code, lambda b, v=c: b.compensation.__setitem__(LANE, v))
+        _refused_step(agent, "speed", code, _SPEED, speed)
+    for compensation in (-1e-300, math.nextafter(2.0, math.inf)):
+        _refused_step(agent, "compensation", code, _COMPENSATION, compensation)
 
 
 @server_rule("refusal-out-of-range-parameter", Level.CORE, "7", "code 2: a parameter outside of its range")
@@ -115,14 +125,9 @@ def refusal_out_of_range_parameter(rig: Rig) -> None:
     """Each bound of each parameter's range; and what stands on a bound that belongs to it is taken."""
     agent = _ready(rig)
     for parameter in PARAMETERS:
-        index = PARAMETER_INDEX[parameter.name]
+        word = _PARAMETERS + PARAMETER_INDEX[parameter.name]
         for value in _beyond(parameter):
-            _refused_reset(
-                agent,
-                f"{parameter.name} = {value!r}",
-                RefusalCode.OUT_OF_RANGE,
-                lambda batch, index=index, value=value: batch.parameters.__setitem__((LANE, index), value),
-            )
+            _refused_reset(agent, parameter.name, RefusalCode.OUT_OF_RANGE, word, value)
     bounds = {p.name: p.lowest for p in PARAMETERS if math.isfinite(p.lowest) and not p.above_lowest}
     done(agent.reset(resets(agent, **bounds)), "a reset with parameters at the lower ends of their ranges")
 
@@ -142,12 +147,7 @@ def refusal_selected(rig: Rig) -> None:
     """No other word means yes."""
     agent = _ready(rig)
     for value in (2, -1, 2**62):
-        _refused_reset(
-            agent,
-            f"selected = {value}",
-            RefusalCode.OUT_OF_RANGE,
-            lambda batch, value=value: batch.selected.__setitem__(LANE, value),
-        )
+        _refused_reset(agent, "selected", RefusalCode.OUT_OF_RANGE, _SELECTED, value)
 
 
 @server_rule(
@@ -159,10 +159,7 @@ def refusal_not_unit_direction(rig: Rig) -> None:
     for beyond in (-_BARELY, _BARELY):
         fly(agent, commands(agent, direction=_long(beyond)), 1)
     for direction in (_long(-_TOO_FAR), _long(_TOO_FAR), (0.0, 0.0, 0.0), (1.0, 1.0, 0.0)):
-        what = f"direction {direction}"
-        _refused_step(
-            agent, what, RefusalCode.NOT_UNIT, lambda b, d=direction: b.direction.__setitem__(LANE, d)
-        )
+        _refused_step(agent, "direction", RefusalCode.NOT_UNIT, 0, direction)
 
 
 def _long(beyond: float) -> tuple[float, float, float]:
@@ -185,36 +182,18 @@ def refusal_not_unit_quaternion(rig: Rig) -> None:
         batch.quaternion[:, :3], batch.quaternion[:, 3] = _long(beyond), 0.0
         done(agent.reset(batch), f"a quaternion of squared length 1 {beyond:+g}")
     for quaternion in ((*_long(-_TOO_FAR), 0.0), (*_long(_TOO_FAR), 0.0), (0.0, 0.0, 0.0, 0.0)):
-        what = f"quaternion {quaternion}"
-        _refused_reset(
-            agent, what, RefusalCode.NOT_UNIT, lambda b, q=quaternion: b.quaternion.__setitem__(LANE, q)
-        )
+        _refused_reset(agent, "quaternion", RefusalCode.NOT_UNIT, _QUATERNION, quaternion)
 
 
 @server_rule("refusal-reserved", Level.CORE, "7", "code 4: a reserved word is not zero, compared as bits")
 def refusal_reserved(rig: Rig) -> None:
     """Each reserved word of both rows; -0.0 is not zero there."""
     agent = _ready(rig)
-    for word in (5, 6, 7):
-        for value in (1, _MINUS_ZERO):
-            _refused_step(
-                agent,
-                f"word {word} of a command row = {value:#x}",
-                RefusalCode.RESERVED,
-                lambda batch, word=word, value=value: batch.raw.view(np.int64).__setitem__(
-                    (LANE, word), value
-                ),
-            )
-    for word in range(16 + len(PARAMETERS), 48):
-        for value in (1, _MINUS_ZERO):
-            _refused_reset(
-                agent,
-                f"word {word} of a reset row = {value:#x}",
-                RefusalCode.RESERVED,
-                lambda batch, word=word, value=value: batch.raw.view(np.int64).__setitem__(
-                    (LANE, word), value
-                ),
-            )
+    for value in (1, _MINUS_ZERO):
+        for word in _COMMAND_RESERVED:
+            _refused_step(agent, f"word {word} of a command row", RefusalCode.RESERVED, word, value)
+        for word in range(_PARAMETERS + len(PARAMETERS), RESET_WORDS):
+            _refused_reset(agent, f"word {word} of a reset row", RefusalCode.RESERVED, word, value)
 
 
 @server_rule("refusal-not-reset", Level.CORE, "7", "code 5: a step while a lane was never reset")
@@ -222,9 +201,9 @@ def refusal_not_reset(rig: Rig) -> None:
     """The first lane that was never reset is named, until all of them were."""
     agent = rig.open(lanes=3)
     refused(agent.step(commands(agent)), "a step before any reset", RefusalCode.NOT_RESET, 0)
-    done(agent.reset(resets(agent, selected=[0, 2])), "a reset of lanes 0 and 2")
+    done(agent.reset(resets(agent, [0, 2])), "a reset of lanes 0 and 2")
     refused(agent.step(commands(agent)), "a step with lane 1 never reset", RefusalCode.NOT_RESET, 1)
-    done(agent.reset(resets(agent, selected=[1])), "a reset of lane 1")
+    done(agent.reset(resets(agent, [1])), "a reset of lane 1")
     fly(agent, commands(agent), 1)
 
 
@@ -232,7 +211,7 @@ def refusal_not_reset(rig: Rig) -> None:
 def refusal_not_reset_first(rig: Rig) -> None:
     """An unsound command in an earlier lane does not hide a lane that was never reset."""
     agent = rig.open(lanes=3)
-    done(agent.reset(resets(agent, selected=[0, 1])), "a reset of lanes 0 and 1")
+    done(agent.reset(resets(agent, [0, 1])), "a reset of lanes 0 and 1")
     batch = commands(agent)
     batch.speed[0] = math.nan
     refused(agent.step(batch), "a NaN in lane 0, and lane 2 never reset", RefusalCode.NOT_RESET, 2)
@@ -248,12 +227,7 @@ def refusal_unknown_tube(rig: Rig) -> None:
     """An index within the slots, one beyond them, and one below -1."""
     agent = _ready(rig)
     for tube in (0, agent.settings.tube_slots, -2):
-        _refused_reset(
-            agent,
-            f"a reset into tube {tube}",
-            RefusalCode.UNKNOWN_TUBE,
-            lambda batch, tube=tube: batch.tube.__setitem__(LANE, tube),
-        )
+        _refused_reset(agent, "tube", RefusalCode.UNKNOWN_TUBE, _TUBE, tube)
     refused(release(agent, 0), "release of a free index", RefusalCode.UNKNOWN_TUBE, -1)
 
 
@@ -287,13 +261,13 @@ def refusal_tube_in_use(rig: Rig) -> None:
     """The first lane in it is named; once all of them have left it may be released."""
     agent = _ready(rig)
     take_box(agent, rig.folder)
-    batch = resets(agent, selected=[1, 2])
+    batch = resets(agent, [1, 2])
     batch.tube[:] = 0
     done(agent.reset(batch), "a reset of lanes 1 and 2 into the tube")
     refused(release(agent, 0), "release with lanes 1 and 2 in the tube", RefusalCode.TUBE_IN_USE, 1)
-    done(agent.reset(resets(agent, selected=[1])), "a reset of lane 1 out of it")
+    done(agent.reset(resets(agent, [1])), "a reset of lane 1 out of it")
     refused(release(agent, 0), "release with lane 2 in the tube", RefusalCode.TUBE_IN_USE, 2)
-    done(agent.reset(resets(agent, selected=[2])), "a reset of lane 2 out of it")
+    done(agent.reset(resets(agent, [2])), "a reset of lane 2 out of it")
     done(release(agent, 0), "release of the empty tube")
 
 
@@ -352,9 +326,7 @@ def refusal_moves_nothing(rig: Rig) -> None:
     moving = commands(agent, speed=0.5 * speed_max(agent), compensation=0.5)
     fly(agent, moving, 2)
     before = agent.poses()
-    _refused_step(
-        agent, "a NaN in lane 1", RefusalCode.NOT_FINITE, lambda b: b.speed.__setitem__(LANE, math.nan)
-    )
+    _refused_step(agent, "speed in lane 1", RefusalCode.NOT_FINITE, _SPEED, math.nan)
     same_bits("poses after a refused step", agent.poses(), before)
     same_bits("the step after it", fly(agent, moving, 1)[-1], fly(undisturbed, moving, 3)[-1])
 
@@ -370,11 +342,10 @@ def refusal_resets_nothing(rig: Rig) -> None:
     fly(agent, moving, 2)
     before = agent.poses()
 
-    def spoil(batch: ResetBatch) -> None:
-        batch.position[:], batch.parameters[:, PARAMETER_INDEX["gravity"]] = 5.0, -3.0
-        batch.quaternion[LANE] = 0.0
-
-    _refused_reset(agent, "a reset with an unsound lane 1", RefusalCode.NOT_UNIT, spoil)
+    batch = resets(agent)
+    batch.position[:], batch.parameters[:, PARAMETER_INDEX["gravity"]] = 5.0, -3.0
+    batch.quaternion[LANE] = 0.0
+    refused(agent.reset(batch), "a reset with an unsound lane 1", RefusalCode.NOT_UNIT, LANE)
     same_bits("poses after a refused reset", agent.poses(), before)
     same_bits("the step after it", fly(agent, moving, 1)[-1], fly(undisturbed, moving, 3)[-1])
 
@@ -388,7 +359,5 @@ def refusal_recovery(rig: Rig) -> None:
         agent.put(tube_index=agent.settings.tube_slots)
         for op in (Op.REGISTER_TUBE, Op.RELEASE_TUBE):
             demand(agent.ask(op).refused is not None, op.name.lower(), "a refusal", "status 0")
-        _refused_step(
-            agent, "c = 3", RefusalCode.OUT_OF_RANGE, lambda batch: batch.compensation.__setitem__(LANE, 3.0)
-        )
+        _refused_step(agent, "compensation", RefusalCode.OUT_OF_RANGE, _COMPENSATION, 3.0)
         fly(agent, commands(agent), 1)

@@ -105,11 +105,11 @@ def _episode(agent: RawAgent, batch: ResetBatch, flown: CommandBatch) -> list[Po
 def reset_nothing(rig: Rig) -> None:
     """Before the first reset and in flight."""
     agent = rig.open()
-    done(agent.reset(resets(agent, selected=[])), "a reset of no lane")
+    done(agent.reset(resets(agent, [])), "a reset of no lane")
     expect("pose rows of lanes that were never reset", agent.poses().raw.any(), False)
     done(agent.reset(_somewhere(agent)), "a reset")
     (before,) = fly(agent, commands(agent), 1)
-    same_bits("poses", done(agent.reset(resets(agent, selected=[])), "a reset of no lane"), before)
+    same_bits("poses", done(agent.reset(resets(agent, [])), "a reset of no lane"), before)
 
 
 @server_rule("reset-unselected", Level.CORE, "7", "words of a row that is not selected are not looked at")

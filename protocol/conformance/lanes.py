@@ -128,7 +128,7 @@ def reset_of_one_lane(rig: Rig) -> None:
         done(each.reset(_own_resets(each, numbers)), "a reset of all lanes")
     flown = _own_commands(agent, numbers)
     before = fly(agent, flown, 3)[-1]
-    batch = resets(agent, selected=[3])
+    batch = resets(agent, [3])
     batch.position[3] = (9.0, 9.0, 9.0)
     poses = done(agent.reset(batch), "a reset of lane 3")
     others = [0, 1, 2, 4, 5, 6]
@@ -146,7 +146,7 @@ def count_of_each_lane(rig: Rig) -> None:
     agent = rig.open(lanes=2)
     done(agent.reset(resets(agent)), "a reset of both lanes")
     fly(agent, commands(agent), 3)
-    poses = done(agent.reset(resets(agent, selected=[1])), "a reset of lane 1")
+    poses = done(agent.reset(resets(agent, [1])), "a reset of lane 1")
     expect("step of each lane", poses.step.tolist(), [3, 0])
     (poses,) = fly(agent, commands(agent), 1)
     expect("step of each lane", poses.step.tolist(), [4, 1])
@@ -157,7 +157,7 @@ def count_of_each_lane(rig: Rig) -> None:
 def rows_never_reset(rig: Rig) -> None:
     """Until each lane's first reset."""
     agent = rig.open(lanes=3)
-    batch = resets(agent, selected=[1])
+    batch = resets(agent, [1])
     batch.position[:] = 4.0
     poses = done(agent.reset(batch), "a reset of lane 1")
     demand(

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from protocol import handshake
+from protocol.conformance.raw_agent import RawAgent
 from protocol.conformance.rig import Rig
 from protocol.conformance.rule import Failure, Level, Skip, demand, server_rule
 from protocol.conformance.sound import commands, done, fly, resets
@@ -26,6 +27,7 @@ IDLE_SHARE: Final = 0.15
 PAUSE_S: Final = 1.0
 _SAMPLES: Final = 2000
 _ROUNDS: Final = 4
+_MANY: Final = 64
 _WARM: Final = 50
 _ECHO_DEADLINE_S: Final = 5.0
 
@@ -74,18 +76,23 @@ def _times(exchange: Callable[[], object], count: int) -> list[float]:
     return times
 
 
-def _stepping(rig: Rig, lanes: int = 1) -> Callable[[], None]:
-    """Open a session whose steps take one inner step, and return what takes one."""
+def _opened(rig: Rig, lanes: int = 1) -> RawAgent:
+    """Open a session whose steps take one inner step, and warm it up."""
     agent = rig.open(lanes=lanes, dt=0.01, inner_steps=1)
     done(agent.reset(resets(agent)), "a reset")
     agent.put_commands(commands(agent))
+    _times(_stepping(agent), _WARM)
+    return agent
+
+
+def _stepping(agent: RawAgent) -> Callable[[], None]:
+    """Return what takes one step, with the commands that stand."""
 
     def step() -> None:
         agent.request(Op.STEP)
         agent.await_bell()
         agent.steps += 1
 
-    _times(step, _WARM)
     return step
 
 
@@ -96,6 +103,11 @@ def _in_turn(exchanges: list[Callable[[], None]], samples: int) -> list[list[flo
         for found, exchange in zip(times, exchanges, strict=True):
             found += _times(exchange, samples // _ROUNDS)
     return times
+
+
+def _at_best(times: list[float]) -> float:
+    """The longest of the fastest tenth: what others do on the machine at the time has little part in it."""
+    return sorted(times)[len(times) // 10]
 
 
 def _in_words(times: list[float]) -> str:
@@ -111,7 +123,7 @@ def _in_words(times: list[float]) -> str:
 def latency(rig: Rig) -> str:
     """Information, beside loopback UDP in the same run."""
     with _udp_echo() as echo:
-        ours, udp = _in_turn([_stepping(rig), echo], _SAMPLES)
+        ours, udp = _in_turn([_stepping(_opened(rig)), echo], _SAMPLES)
     ratio = statistics.median(ours) / statistics.median(udp)
     return (
         f"p50 / p99 / p99.9 {_in_words(ours)} us, loopback UDP {_in_words(udp)} us in the same run; "
@@ -123,12 +135,14 @@ def latency(rig: Rig) -> str:
     "no-sleep-in-step",
     Level.PERFORMANCE,
     "10",
-    f"no sleep in the step path: p50 of a step below {SLEEPLESS:g} times that of loopback UDP",
+    f"no sleep in the step path: a step takes less than {SLEEPLESS:g} times loopback UDP",
 )
 def no_sleep_in_step(rig: Rig) -> str:
     """One lane, one inner step, in the same run."""
     with _udp_echo() as echo:
-        ours, udp = (statistics.median(times) for times in _in_turn([_stepping(rig), echo], _SAMPLES // 4))
+        ours, udp = (
+            statistics.median(times) for times in _in_turn([_stepping(_opened(rig)), echo], _SAMPLES // 4)
+        )
     demand(ours < SLEEPLESS * udp, "p50 of a step", f"below {SLEEPLESS * udp:.0f} us", f"{ours:.0f} us")
     return f"{ours / udp:.2f} times UDP"
 
@@ -171,9 +185,27 @@ def long_pause(rig: Rig) -> None:
     fly(agent, commands(agent), 2)
 
 
-@server_rule("lanes-cost", Level.PERFORMANCE, "10", "a step of 64 lanes costs less than 64 steps of one")
+@server_rule(
+    "lanes-cost",
+    Level.PERFORMANCE,
+    "5",
+    f"but for the engine's own time a step of {_MANY} lanes costs less than {_MANY} steps of one",
+)
 def lanes_cost(rig: Rig) -> str:
-    """By the medians, measured in turn."""
-    one, many = (statistics.median(times) for times in _in_turn([_stepping(rig), _stepping(rig, 64)], 200))
-    demand(many < 64 * one, "p50 of a step of 64 lanes", f"below {64 * one:.0f} us", f"{many:.0f} us")
+    """By the round trip less `engine_ns`, measured in turn."""
+    agents = [_opened(rig), _opened(rig, _MANY)]
+    times: list[list[float]] = [[], []]
+    for _ in range(_ROUNDS):
+        for agent, found in zip(agents, times, strict=True):
+            step = _stepping(agent)
+            for _ in range(50):
+                (whole,) = _times(step, 1)
+                found.append(whole - agent.get("engine_ns") / 1e3)
+    one, many = map(_at_best, times)
+    demand(
+        many < _MANY * one,
+        f"a step of {_MANY} lanes less engine_ns, at best",
+        f"below {_MANY * one:.0f} us",
+        f"{many:.0f} us",
+    )
     return f"{many / one:.1f} times a step of one lane"

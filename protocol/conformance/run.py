@@ -4,14 +4,60 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
+from typing import Final
 
 import numpy as np
 
+# The modules of rules register them when they are imported.
+from protocol.conformance import (  # noqa: F401
+    agent_faults,
+    agent_violations,
+    agents,
+    core_exchange,
+    core_handshake,
+    core_law,
+    core_refusals,
+    core_requests,
+    lanes,
+    occupancy,
+    performance,
+    robustness,
+    violations,
+)
 from protocol.conformance.rig import Rig
-from protocol.conformance.rule import Failure, Outcome, Result, Rule, Skip
+from protocol.conformance.rule import AGENT_RULES, SERVER_RULES, Failure, Level, Outcome, Result, Rule, Skip
+from protocol.handshake import magic
+
+RULES: Final[dict[str, dict[str, Rule]]] = {"server": SERVER_RULES, "agent": AGENT_RULES}
+"""All rules by the side that has to keep them, then by name."""
+
+TIMEOUT_S: Final = 10.0
+"""How long a peer may take to start, or to answer, if nobody says otherwise."""
 
 
-def run_rule(rule: Rule, command: str, transport: str = "shm", timeout: float = 10.0) -> Result:
+def select(side: str, levels: Iterable[Level] = (), names: Iterable[str] = ()) -> list[Rule]:
+    """Return the rules for a side by level and section: all of them, or those of some levels and some names.
+
+    Args:
+        side: "server" or "agent".
+        levels: these alone; none means all.
+        names: these alone; none means all.
+
+    Raises:
+        KeyError: there is no rule of such a name.
+    """
+    rules, wanted = RULES[side], list(levels)
+    chosen = [rules[name] for name in names] or list(rules.values())
+    return sorted((rule for rule in chosen if not wanted or rule.level in wanted), key=_place)
+
+
+def _place(rule: Rule) -> tuple[int, int]:
+    """Sort by level, then by section, the annexes last."""
+    section = int(rule.section) if rule.section.isdigit() else ord(rule.section)
+    return list(Level).index(rule.level), section
+
+
+def run_rule(rule: Rule, command: str, transport: str = "shm", timeout: float = TIMEOUT_S) -> Result:
     """Start `COMMAND RENDEZVOUS` for one rule, run its check, and clear everything away.
 
     Args:
@@ -36,19 +82,42 @@ def run_suite(
     rules: Iterable[Rule],
     command: str,
     transport: str = "shm",
-    timeout: float = 10.0,
+    timeout: float = TIMEOUT_S,
     on_start: Callable[[Rule], None] | None = None,
-    on_result: Callable[[Result], None] | None = None,
 ) -> list[Result]:
-    """Run rules one after the other; `on_start` and `on_result` hear of each as it goes."""
+    """Run rules one after the other; `on_start` hears of each before it runs.
+
+    The arguments are those of `run_rule`. Where nothing ever attaches, the rules fail without being tried: each
+    would wait for as long as the first.
+    """
+    rules = list(rules)
+    worth_it = len(rules) > 1 and rules[0] in SERVER_RULES.values()
+    silence = _silence(command, transport, timeout) if worth_it else None
     results: list[Result] = []
     for rule in rules:
         if on_start is not None:
             on_start(rule)
-        results.append(run_rule(rule, command, transport, timeout))
-        if on_result is not None:
-            on_result(results[-1])
+        if silence is not None:
+            results.append(Result(rule, Outcome.FAILED, *silence, seconds=0.0))
+        else:
+            results.append(run_rule(rule, command, transport, timeout))
     return results
+
+
+def _silence(command: str, transport: str, timeout: float) -> tuple[str, str] | None:
+    """Say what was found where a server runs but says nothing to a sound offer, and what it printed; else None."""
+    with Rig(command, transport, timeout) as rig:
+        agent = rig.agent()
+        agent.offer()
+        process = rig.start()
+        agent.attend(process)
+        try:
+            agent.await_header()
+        except Failure as failure:
+            if any(magic(agent.pose)) or agent.farewell()[0] or process.watch() is not None:
+                return None  # it says something, or ends: the rules tell more, and soon
+            return f"not tried: {failure}", rig.last_words()
+    return None
 
 
 def conforms(results: Iterable[Result]) -> bool:

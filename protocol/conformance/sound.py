@@ -13,7 +13,7 @@ from protocol.conformance.raw_agent import RawAgent, Refused, Reply
 from protocol.conformance.rule import Failure, Skip, demand, expect
 from protocol.errors import RefusalCode
 from protocol.layout import POSE, Axes, Op
-from protocol.plant import PARAMETER_INDEX, PARAMETERS, CommandBatch, PoseBatch, ResetBatch
+from protocol.plant import PARAMETER_INDEX, PARAMETERS, CommandBatch, Floats, PoseBatch, ResetBatch
 
 Vector = Sequence[float]
 
@@ -43,16 +43,16 @@ def has_walls(agent: RawAgent) -> bool:
     return agent.get("walls") == 1
 
 
-def resets(agent: RawAgent, *, selected: Sequence[int] | None = None, **parameters: float) -> ResetBatch:
-    """Resets of all lanes, or of those `selected`, to rest at the origin, with the server's own defaults.
+def resets(agent: RawAgent, lanes: Sequence[int] | None = None, /, **parameters: float) -> ResetBatch:
+    """Resets of all lanes, or of those given, to rest at the origin, with the server's own defaults.
 
     Args:
         agent: whose session it is.
-        selected: lanes to reset.
+        lanes: the lanes to reset.
         parameters: by name, in place of the defaults.
     """
     batch = ResetBatch.zeros(agent.settings.lanes)
-    batch.selected[range(agent.settings.lanes) if selected is None else list(selected)] = 1
+    batch.selected[range(agent.settings.lanes) if lanes is None else list(lanes)] = 1
     batch.parameters[:] = layout.read_f64(agent.pose, POSE["defaults"])
     for name, value in parameters.items():
         batch.parameters[:, PARAMETER_INDEX[name]] = value
@@ -136,7 +136,7 @@ def same_bits(
         raise Failure(f"{what}, word {word} of the row", values[1], values[0])
 
 
-def close_to(what: str, found: Sequence[float], expected: Sequence[float], tolerance: float) -> None:
+def close_to(what: str, found: Vector | Floats, expected: Vector | Floats, tolerance: float) -> None:
     """Demand that numbers agree within a tolerance.
 
     Raises:

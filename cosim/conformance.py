@@ -1,0 +1,141 @@
+"""`cosim conformance`: prove any program against the rules of the protocol."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import click
+
+from cosim.errors import OutputError, PeerCommandError
+from protocol.conformance.report import json_report, junit_report, text_report
+from protocol.conformance.rule import Level, Outcome, Result, Rule
+from protocol.conformance.run import RULES, conforms, run_suite, select
+from protocol.layout import VERSION_MAJOR, VERSION_MINOR
+
+_COLOURS: Final = {Outcome.PASSED: "green", Outcome.FAILED: "red", Outcome.SKIPPED: "yellow"}
+
+
+@dataclass(frozen=True)
+class ConformanceOptions:
+    """What is to be proved; the fields are the options of the command."""
+
+    server: str | None
+    agent: str | None
+    transport: str
+    levels: str | None
+    names: tuple[str, ...]
+    timeout: float
+    junit: Path | None
+
+
+def conformance(options: ConformanceOptions, *, as_json: bool, as_list: bool) -> bool:
+    """Run the rules and print the report, or list them; returns whether every required one holds.
+
+    Raises:
+        click.UsageError: neither or both sides were named, or a level or rule is unknown.
+        PeerCommandError: the command cannot be run.
+        OutputError: the JUnit file cannot be written.
+    """
+    side, command = _side(options, needed=not as_list)
+    if as_list:
+        _list([side] if side else list(RULES), options)
+        return True
+    assert command is not None
+    _check_command(side, command)
+    rules = _rules(side, options)
+    if options.junit is not None and not options.junit.parent.is_dir():  # said before minutes are spent
+        raise OutputError(f"--junit {options.junit}: there is no folder {options.junit.parent}")
+    results = _run(rules, command, options)
+    if options.junit is not None:
+        _write(options.junit, junit_report(results, side, options.transport))
+    if as_json:
+        click.echo(json.dumps(json_report(results, side, command, options.transport)))
+    else:
+        version = f"{VERSION_MAJOR}.{VERSION_MINOR}"
+        click.echo(
+            text_report(results, f"{side} {command!r} over {options.transport}, protocol {version}", _paint)
+        )
+    return conforms(results)
+
+
+def _side(options: ConformanceOptions, *, needed: bool) -> tuple[str, str | None]:
+    given = {"server": options.server, "agent": options.agent}
+    named = [(side, command) for side, command in given.items() if command is not None]
+    if len(named) == 1:
+        return named[0]
+    if named or needed:
+        raise click.UsageError("expected one of --server COMMAND and --agent COMMAND")
+    return "", None
+
+
+def _check_command(side: str, command: str) -> None:
+    """Refuse a command that cannot be run, once and not by every rule."""
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise PeerCommandError(f"--{side}: expected a command, found {command!r} ({error})") from error
+    if not words or shutil.which(words[0]) is None:
+        found = repr(words[0]) if words else "an empty string"
+        raise PeerCommandError(f"--{side}: expected a program that can be run, found {found}, which cannot")
+
+
+def _rules(side: str, options: ConformanceOptions) -> list[Rule]:
+    values = {level.value: level for level in Level}
+    wanted = [] if options.levels is None else [name.strip() for name in options.levels.split(",")]
+    for name in wanted:
+        if name not in values:
+            raise click.UsageError(f"--level: expected some of {', '.join(values)}, found {name!r}")
+    for name in options.names:
+        if name not in RULES[side]:
+            raise click.UsageError(
+                f"--rule: there is no rule {name!r} for the {side}; cosim conformance --list names all"
+            )
+    rules = select(side, [values[name] for name in wanted], options.names)
+    if not rules:
+        raise click.UsageError("no rule of these names is of these levels")
+    return rules
+
+
+def _run(rules: Sequence[Rule], command: str, options: ConformanceOptions) -> list[Result]:
+    """Run the rules, with a line on stderr that says where they are, if that is a terminal."""
+    live, begun = sys.stderr.isatty(), 0
+
+    def on_start(rule: Rule) -> None:
+        nonlocal begun
+        begun += 1
+        if live:
+            click.echo(f"\r\033[K{begun}/{len(rules)} {rule.level.value} {rule.name}", err=True, nl=False)
+
+    try:
+        return run_suite(rules, command, options.transport, options.timeout, on_start)
+    finally:
+        if live:
+            click.echo("\r\033[K", err=True, nl=False)
+
+
+def _list(sides: Sequence[str], options: ConformanceOptions) -> None:
+    for side in sides:
+        for rule in _rules(side, options):
+            optional = "" if rule.required else " (not required)"
+            click.echo(
+                f"{side:6}  {rule.level.value:11}  {rule.section:>2}  {rule.name}: {rule.title}{optional}"
+            )
+
+
+def _paint(text: str, outcome: Outcome) -> str:
+    """Colour a word; click takes colours away where stdout is no terminal."""
+    return click.style(text, fg=_COLOURS[outcome])
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"--junit {path}: cannot be written: {error.strerror}") from error

@@ -1,0 +1,158 @@
+"""What came out, for people, for programs (JSON) and for continuous integration (JUnit XML)."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+from xml.etree import ElementTree
+
+from protocol.conformance.rule import Level, Outcome, Result
+from protocol.conformance.run import conforms
+from protocol.layout import VERSION_MAJOR, VERSION_MINOR
+
+SCHEMA: Final = 1
+"""Version of the JSON's form; it changes when a reader of the old one would misunderstand."""
+
+Paint = Callable[[str, Outcome], str]
+"""Gives a word the colour of an outcome, or not."""
+
+_NOT_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+"""Characters that no XML may hold, though a peer may print them."""
+
+
+def plain(text: str, outcome: Outcome) -> str:
+    """Paint nothing."""
+    return text
+
+
+def text_report(results: Sequence[Result], heading: str, paint: Paint = plain) -> str:
+    """Write one line a rule under its level, with what was found below it, and the sum in the last line.
+
+    Args:
+        results: in the order of levels.
+        heading: the first line: what was judged.
+        paint: colours the word of an outcome.
+    """
+    lines, said = [heading], ""
+    for level in Level:
+        of_level = [result for result in results if result.rule.level is level]
+        if not of_level:
+            continue
+        lines += ["", f"{level.value}: {_sum(of_level)}"]
+        for result in of_level:
+            lines.append(_line(result, paint))
+            remark = _remark(result)
+            lines += [
+                f"{_INDENT}{line}"
+                for line in (["as above"] if remark and remark == said else remark.splitlines())
+            ]
+            said = remark
+    verdict, outcome = (
+        ("conforms", Outcome.PASSED) if conforms(results) else ("does not conform", Outcome.FAILED)
+    )
+    return "\n".join([*lines, "", f"{paint(verdict, outcome)}: {_sum(results)}"])
+
+
+_INDENT: Final = " " * 13
+
+
+def _line(result: Result, paint: Paint) -> str:
+    rule = result.rule
+    word = paint(f"{result.outcome.value:<7}", result.outcome)
+    optional = "" if rule.required else " (not required)"
+    section = f"annex {rule.section}" if rule.section.isalpha() else f"§{rule.section}"
+    return f"  {word}  {section:<7}  {rule.name}: {rule.title}{optional}"
+
+
+def _remark(result: Result) -> str:
+    if result.outcome is not Outcome.FAILED:
+        return result.details
+    words = "".join(f"\n| {line}" for line in result.last_words.splitlines())
+    return result.details + (f"\nthe peer printed:{words}" if words else "")
+
+
+def _sum(results: Sequence[Result]) -> str:
+    counts = Counter(result.outcome for result in results)
+    return ", ".join(f"{counts[outcome]} {outcome.value}" for outcome in Outcome if counts[outcome])
+
+
+def json_report(results: Sequence[Result], side: str, command: str, transport: str) -> dict[str, Any]:
+    """Return the report as what `json.dumps` takes."""
+    counts = Counter(result.outcome for result in results)
+    return {
+        "schema": SCHEMA,
+        "protocol": f"{VERSION_MAJOR}.{VERSION_MINOR}",
+        "side": side,
+        "command": command,
+        "transport": transport,
+        "conforms": conforms(results),
+        **{outcome.value: counts[outcome] for outcome in Outcome},
+        "rules": [
+            {
+                "name": result.rule.name,
+                "level": result.rule.level.value,
+                "section": result.rule.section,
+                "title": result.rule.title,
+                "required": result.rule.required,
+                "outcome": result.outcome.value,
+                "details": result.details,
+                "last_words": result.last_words,
+                "seconds": round(result.seconds, 3),
+            }
+            for result in results
+        ],
+    }
+
+
+def junit_report(results: Sequence[Result], side: str, transport: str) -> str:
+    """Write JUnit XML: a suite a level, a case a rule; a rule that is not required never fails there."""
+    root = ElementTree.Element(
+        "testsuites", {"name": f"conformance of the {side} over {transport}", **_totals(results)}
+    )
+    for level in Level:
+        of_level = [result for result in results if result.rule.level is level]
+        if of_level:
+            suite = ElementTree.SubElement(
+                root, "testsuite", {"name": f"{side}.{level.value}", **_totals(of_level)}
+            )
+            for result in of_level:
+                _case(suite, result, f"{side}.{transport}.{level.value}")
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _case(suite: ElementTree.Element, result: Result, group: str) -> None:
+    case = ElementTree.SubElement(
+        suite, "testcase", classname=group, name=result.rule.name, time=f"{result.seconds:.3f}"
+    )
+    told = _xml(result.details)
+    if _fails(result):
+        failure = ElementTree.SubElement(case, "failure", message=told, type="Failure")
+        failure.text = f"section {result.rule.section}: {result.rule.title}\n{told}"
+    elif result.outcome is not Outcome.PASSED:
+        ElementTree.SubElement(case, "skipped", message=told)
+    printed = result.last_words if result.outcome is Outcome.FAILED else ""
+    if printed or (told and result.outcome is Outcome.PASSED):
+        ElementTree.SubElement(case, "system-out").text = _xml(printed) or told
+
+
+def _fails(result: Result) -> bool:
+    return result.outcome is Outcome.FAILED and result.rule.required
+
+
+def _totals(results: Sequence[Result]) -> dict[str, str]:
+    failures = sum(map(_fails, results))
+    passed = sum(result.outcome is Outcome.PASSED for result in results)
+    return {
+        "tests": str(len(results)),
+        "failures": str(failures),
+        "errors": "0",
+        "skipped": str(len(results) - failures - passed),
+        "time": f"{sum(result.seconds for result in results):.3f}",
+    }
+
+
+def _xml(text: str) -> str:
+    return _NOT_XML.sub("?", text)
