@@ -323,6 +323,53 @@ def doctor(clean: bool, as_json: bool) -> None:
         sys.exit(EXIT_FAILED_CHECK)
 
 
+@cosim.command(short_help="Prove a physics side or an agent in any language against the protocol.")
+@click.option(
+    "--server",
+    metavar="COMMAND",
+    help="Physics side, started as COMMAND RENDEZVOUS for every rule; {} in COMMAND stands for RENDEZVOUS.",
+)
+@click.option("--agent", metavar="COMMAND", help="Agent, started likewise.")
+@click.option(
+    "--transport",
+    type=click.Choice(["shm", "file"]),
+    default="shm",
+    show_default=True,
+    help="Of the segments.",
+)
+@click.option(
+    "--level", "levels", metavar="A,B,...", help="core, robustness, lanes, performance [default: all]."
+)
+@click.option("--rule", "names", metavar="NAME", multiple=True, help="This rule alone; may be repeated.")
+@click.option(
+    "--timeout",
+    type=click.FloatRange(min=0.1, max=3600.0),
+    metavar="SECONDS",
+    default=10.0,
+    show_default=True,
+    help="To start or to answer.",
+)
+@click.option("--junit", type=click.Path(path_type=Path), metavar="FILE", help="Write JUnit XML as well.")
+@click.option("--list", "as_list", is_flag=True, help="Name the rules and run none.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, nothing else.")
+def conformance(as_list: bool, as_json: bool, **options: Any) -> None:
+    """Prove any program against the rules of the protocol, which protocol/README.md specifies.
+
+    Exit status 0 if every required rule holds, else 1. A rule is skipped where the program says that it cannot do
+    what the rule is about.
+
+    \b
+    cosim conformance --server "python -m physics_server"
+    cosim conformance --server ./server --transport file --level core,lanes --junit conformance.xml
+    cosim conformance --agent "python -m protocol.conformance.toy_agent" --json
+    """
+    from cosim.conformance import ConformanceOptions
+    from cosim.conformance import conformance as run
+
+    if not run(ConformanceOptions(**options), as_json=as_json, as_list=as_list):
+        sys.exit(EXIT_FAILED_CHECK)
+
+
 def _interrupted(number: int, _frame: FrameType | None) -> None:
     """Ctrl-C or SIGTERM: the first one ends the command in order, and another must not cut the cleaning up short."""
     for deaf_to in (signal.SIGINT, signal.SIGTERM):
