@@ -18,6 +18,8 @@ from cosim.named_settings import SettingsCommand, take_settings
 from cosim.options import FlightOptions, evaluate_options, flight_options
 
 EXIT_NO_SUCCESS: Final = 1
+FORMATS: Final = ("csv", "npz", "parquet", "tum", "mcap", "gltf", "usd")
+"""Of `cosim.export`, whose imports a command's help does not wait for."""
 EXIT_FAILED_CHECK: Final = 1
 
 _COUNT: Final = click.IntRange(min=1)
@@ -58,17 +60,26 @@ def launch(require_success: bool, as_json: bool, **options: Any) -> None:
 
 @cosim.command(short_help="Write a recorded run in another format.")
 @click.argument("run", type=click.Path(path_type=Path))
-@click.option("--format", "kind", type=click.Choice(["csv", "npz", "parquet"]), required=True)
+@click.option("--format", "kind", type=click.Choice(FORMATS), required=True)
 @click.option("--output", "-o", type=click.Path(path_type=Path), help="File [default: RUN/steps.<format>].")
 def export(run: Path, kind: str, output: Path | None) -> None:
-    """Write a recorded run as CSV, NumPy archive or Parquet, from its folder alone.
+    """Write a recorded run in another format, from its folder alone.
+
+    \b
+    csv, npz, parquet  every number of every step, with units and frames
+    tum                trajectory for `evo` and SLAM benchmarks
+    mcap               poses, scans, commands and state for Foxglove
+    gltf, usd          animated scene for Blender, Unity and web viewers
 
     \b
     cosim export runs/2026-... --format parquet
     """
     from cosim.export import export as write
 
-    click.echo(write(run, kind, output))
+    path, note = write(run, kind, output)
+    if note:
+        click.echo(note, err=True)
+    click.echo(path)
 
 
 @cosim.command(short_help="Check a recorded run, and replay its commands through fresh physics.")

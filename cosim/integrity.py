@@ -19,10 +19,8 @@ from cosim.recording import (
     manifest_digest,
     next_link,
 )
-from cosim.runs import Run, element_names
+from cosim.runs import Run, chunks, element_names
 
-CHUNK: Final = 4096
-"""Records that are in memory at a time."""
 PAYLOAD_BYTES: Final = COMMAND_BYTES + POSE_BYTES
 
 
@@ -50,9 +48,8 @@ def check_data(run: Run) -> Iterator[Finding]:
     yield from _check_manifest(run)
     chain = b""
     damaged = False
-    for first in range(0, len(run.records), CHUNK):
-        stored = run.records[first : first + CHUNK]
-        size = stored.dtype.itemsize
+    first, size = 0, run.records.dtype.itemsize
+    for stored in chunks(run):
         # As bytes: a copy by fields leaves out what lies between them.
         rows = bytearray(stored.tobytes())
         np.frombuffer(rows, stored.dtype)["check"] = 0
@@ -67,6 +64,7 @@ def check_data(run: Run) -> Iterator[Finding]:
                 yield Finding("hash chain", "the hash of all commands and poses so far", "another", first + i)
             # After damage the chain goes on from what stands, so that one fault is not named at every step.
             chain, damaged = link, not whole
+        first += len(stored)
     yield from _check_end(run, chain)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +13,9 @@ from numpy.typing import NDArray
 
 from cosim.errors import RunError
 from cosim.recording import FORMAT, MANIFEST, Column, record_dtype
+
+CHUNK: Final = 8192
+"""Records that are in memory at a time."""
 
 AXES: Final = ("x", "y", "z")
 
@@ -58,6 +62,18 @@ def read_run(folder: Path) -> Run:
     except OSError as error:
         raise RunError(f"{log}: expected the log of a run, found none ({error.strerror})") from error
     return Run(folder, manifest, columns, records)
+
+
+def chunks(run: Run) -> Iterator[NDArray[np.void]]:
+    """The records of a run, some thousands at a time; read and not mapped, so that memory stays bounded."""
+    with (run.folder / run.manifest["log"]).open("rb") as log:
+        for start in range(0, len(run.records), CHUNK):
+            yield np.fromfile(log, run.records.dtype, min(CHUNK, len(run.records) - start))
+
+
+def column(run: Run, name: str) -> NDArray[Any]:
+    """One field of all records, (T, ...), as an array of its own."""
+    return np.concatenate([records[name] for records in chunks(run)])
 
 
 def element_names(column: Column) -> list[str]:

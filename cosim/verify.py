@@ -19,6 +19,7 @@ from cosim.integrity import Finding, check_data
 from cosim.live import counting
 from cosim.recording import COMMAND_BYTES, PAYLOAD, POSE_BYTES
 from cosim.runs import Run, element_names, read_run
+from cosim.scene import where_is
 from cosim.sessions import ATTACH_TIMEOUT, physics_session, rendezvous_of
 from cosim.supervise import PhysicsProcess, physics_command
 from cosim.versions import versions
@@ -83,12 +84,12 @@ def find_tube(run: Run, mesh: Path | None) -> tuple[TubeReference | None, list[F
     A file that the run keeps itself (a generated tube) is looked for in its folder first.
     """
     described = run.manifest["mesh"]
-    path = mesh or _where(run, described["path"])
+    path = mesh or where_is(run, described["path"])
     found = _file_hash(path)
     findings = []
     if found != described["sha256"]:
         findings.append(Finding(f"mesh {path}", f"SHA-256 {described['sha256'][:16]}…", found[:16] + "…"))
-    centreline = _where(run, described["centreline"]) if described.get("centreline") else None
+    centreline = where_is(run, described["centreline"]) if described.get("centreline") else None
     if centreline is not None and mesh is None:
         hashed = _file_hash(centreline)
         if hashed != described["centreline_sha256"]:
@@ -202,12 +203,6 @@ def _check_versions(run: Run) -> Iterator[Finding]:
     for name, then in run.manifest["versions"].items():
         if now.get(name) != then:
             yield Finding(f"version of {name}", str(then), str(now.get(name)))
-
-
-def _where(run: Run, recorded: str) -> Path:
-    """Where a file of the run is: in the run folder if it went with it, else where it was."""
-    beside = run.folder / Path(recorded).name
-    return beside if beside.is_file() else Path(recorded)
 
 
 def _file_hash(path: Path) -> str:

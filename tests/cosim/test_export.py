@@ -45,7 +45,7 @@ def test_reward_terms_sum_to_the_reward(run: Run) -> None:
 
 def test_csv_is_read_back_by_the_csv_module(run: Run, tmp_path: Path) -> None:
     """Every number of the log stands in the CSV, exactly."""
-    path = export(run.folder, "csv", tmp_path / "run.csv")
+    path, _ = export(run.folder, "csv", tmp_path / "run.csv")
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(run.records)
@@ -56,7 +56,7 @@ def test_csv_is_read_back_by_the_csv_module(run: Run, tmp_path: Path) -> None:
 
 def test_npz_is_read_back_by_numpy_without_pickle(run: Run, tmp_path: Path) -> None:
     """Fields keep name, shape and type; the manifest travels along."""
-    path = export(run.folder, "npz", tmp_path / "run.npz")
+    path, _ = export(run.folder, "npz", tmp_path / "run.npz")
     with np.load(path, allow_pickle=False) as archive:
         assert np.array_equal(archive["linear_velocity"], run.records["linear_velocity"])
         assert json.loads(str(archive["manifest"]))["outcome"]["outcome"] == "success"
@@ -65,7 +65,7 @@ def test_npz_is_read_back_by_numpy_without_pickle(run: Run, tmp_path: Path) -> N
 def test_parquet_is_read_back_by_pyarrow_with_units(run: Run, tmp_path: Path) -> None:
     """Columns keep their values, units and frames."""
     pq = pytest.importorskip("pyarrow.parquet", reason="the extra 'export' is not installed")
-    table = pq.read_table(export(run.folder, "parquet", tmp_path / "run.parquet"))
+    table = pq.read_table(export(run.folder, "parquet", tmp_path / "run.parquet")[0])
     assert table["position_x"].to_pylist() == run.records["position"][:, 0].tolist()
     assert table.schema.field("position_x").metadata == {b"unit": b"m", b"frame": b"world"}
     assert json.loads(table.schema.metadata[b"cosim.manifest"])["format"] == 2

@@ -1,0 +1,79 @@
+"""A run as a table: CSV, NumPy archive, Parquet, streamed from the log."""
+
+from __future__ import annotations
+
+import csv
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.errors import CosimError
+from cosim.recording import Column
+from cosim.runs import Run, chunks, element_names
+
+
+def _scalars(records: NDArray[np.void], column: Column) -> list[NDArray[Any]]:
+    values = records[column.name].reshape(len(records), -1)
+    return [values[:, i] for i in range(values.shape[1])]
+
+
+def write_csv(run: Run, target: Path) -> str:
+    """Write one row a record, with every number exact; nothing is lost."""
+    with target.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([name for c in run.columns for name in element_names(c)])
+        for records in chunks(run):
+            columns = [scalar.tolist() for c in run.columns for scalar in _scalars(records, c)]
+            writer.writerows(zip(*columns, strict=True))
+    return ""
+
+
+def write_npz(run: Run, target: Path) -> str:
+    """Write a NumPy archive: an array a field, and the manifest as text."""
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+        with archive.open("manifest.npy", "w") as member:
+            np.lib.format.write_array(member, np.array(json.dumps(run.manifest)), allow_pickle=False)
+        for column in run.columns:
+            header = {
+                "descr": np.lib.format.dtype_to_descr(np.dtype(column.type)),
+                "fortran_order": False,
+                "shape": (len(run.records), *column.shape),
+            }
+            # Piece by piece, since `numpy.savez` wants whole arrays.
+            with archive.open(f"{column.name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array_header_2_0(member, header)
+                for records in chunks(run):
+                    member.write(np.ascontiguousarray(records[column.name]).tobytes())
+    return ""
+
+
+def write_parquet(run: Run, target: Path) -> str:
+    """Write Parquet with unit and frame of every column and the manifest in its metadata.
+
+    Raises:
+        CosimError: pyarrow is not installed.
+    """
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError as error:
+        raise CosimError(
+            "Parquet needs pyarrow; install it with: pip install 'tube-cosim[export]'"
+        ) from error
+    schema = pa.schema(
+        [
+            pa.field(name, pa.from_numpy_dtype(np.dtype(c.type)), metadata={"unit": c.unit, "frame": c.frame})
+            for c in run.columns
+            for name in element_names(c)
+        ],
+        metadata={"cosim.manifest": json.dumps(run.manifest)},
+    )
+    with pq.ParquetWriter(target, schema, compression="zstd") as writer:
+        for records in chunks(run):
+            arrays = [np.ascontiguousarray(s) for c in run.columns for s in _scalars(records, c)]
+            writer.write_table(pa.table(arrays, schema=schema))
+    return ""
