@@ -132,13 +132,14 @@ class SessionStatus:
 class Observer:
     """Looks on at one session; `attach` makes one. Use it as a context manager, or close it."""
 
-    def __init__(self, rendezvous: Rendezvous, command: ReadOnlySegment, pose: ReadOnlySegment) -> None:
+    def __init__(
+        self, rendezvous: Rendezvous, offer: Offer, command: ReadOnlySegment, pose: ReadOnlySegment
+    ) -> None:
         self.rendezvous = rendezvous
         self.torn = 0
         """Readings that were given up because every try was torn: a writer that is stopped or dead in mid-write."""
-        self._offer: Offer = handshake.read_offer(command.view)
-        lanes = self._offer.settings.lanes
-        handshake.check_size(pose.view, layout.pose_bytes(lanes), "pose segment")
+        self._offer = offer
+        lanes = offer.settings.lanes
         self._answer: Answer | None = None
         self._seen = 0
         self._views = ExitStack()
@@ -353,6 +354,7 @@ def _try_attach(place: Rendezvous) -> Observer | None:
             )
         if handshake.magic(command.view) == bytes(8):
             return None
+        offer = handshake.read_offer(command.view)
         pose = open_read_only(place, POSE_SUFFIX)
         if pose is None:
             return None
@@ -361,7 +363,8 @@ def _try_attach(place: Rendezvous) -> Observer | None:
             not command.stands()
         ):  # a new session took its place meanwhile, and the second segment is of that one
             return None
-        observer = Observer(place, command, pose)
+        handshake.check_size(pose.view, layout.pose_bytes(offer.settings.lanes), "pose segment")
+        observer = Observer(place, offer, command, pose)
         opened.pop_all()
         return observer
 
