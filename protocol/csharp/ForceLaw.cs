@@ -1,5 +1,7 @@
 // Annex A: force and torque from command and state, for plants whose engine integrates. In the protocol's frame.
 
+using Word = TubeCosim.Layout.ParameterIndex;
+
 namespace TubeCosim
 {
     public static class ForceLaw
@@ -7,24 +9,24 @@ namespace TubeCosim
         // Force at the centre of mass (N) without the weight, which the engine applies.
         public static Vector3d Force(LanePose pose, LaneCommand command, double[] parameters, Vector3d gust)
         {
-            double mass = parameters[Layout.ParameterIndex.Mass], gain = parameters[Layout.ParameterIndex.ForceGain];
-            bool alongBody = parameters[Layout.ParameterIndex.ForceAlongBody] != 0.0;
+            double mass = parameters[Word.Mass], gain = parameters[Word.ForceGain];
+            bool alongBody = parameters[Word.ForceAlongBody] != 0.0;
             Vector3d along = alongBody ? Forward(pose) : command.Direction;
             Vector3d wanted = command.Speed * along - pose.LinearVelocity;
-            double lift = command.Compensation * mass * parameters[Layout.ParameterIndex.Gravity];
-            Vector3d disturbance = new Vector3d(parameters[Layout.ParameterIndex.DisturbanceX],
-                parameters[Layout.ParameterIndex.DisturbanceY], parameters[Layout.ParameterIndex.DisturbanceZ] + lift);
-            return mass * gain * wanted - parameters[Layout.ParameterIndex.LinearDrag] * pose.LinearVelocity + disturbance
+            double lift = command.Compensation * mass * parameters[Word.Gravity];
+            Vector3d disturbance = new Vector3d(parameters[Word.DisturbanceX],
+                parameters[Word.DisturbanceY], parameters[Word.DisturbanceZ] + lift);
+            return mass * gain * wanted - parameters[Word.LinearDrag] * pose.LinearVelocity + disturbance
                 + gust;
         }
 
         // Torque in the world's frame (N m), without the gyroscopic one.
         public static Vector3d Torque(LanePose pose, LaneCommand command, double[] parameters)
         {
-            Vector3d wanted = parameters[Layout.ParameterIndex.TorqueKp] * Vector3d.Cross(Forward(pose), command.Direction)
-                - parameters[Layout.ParameterIndex.TorqueKd] * pose.AngularVelocity;
+            Vector3d wanted = parameters[Word.TorqueKp] * Vector3d.Cross(Forward(pose), command.Direction)
+                - parameters[Word.TorqueKd] * pose.AngularVelocity;
             return TimesInertia(pose, parameters, wanted)
-                - parameters[Layout.ParameterIndex.AngularDrag] * pose.AngularVelocity;
+                - parameters[Word.AngularDrag] * pose.AngularVelocity;
         }
 
         // -omega x I omega (N m), for an engine that leaves it out, as PhysX does unless it is asked.
@@ -66,8 +68,8 @@ namespace TubeCosim
         private static Vector3d TimesInertia(LanePose pose, double[] parameters, Vector3d v)
         {
             Vector3d inBody = pose.Rotation.Inverse().Rotate(v);
-            return pose.Rotation.Rotate(new Vector3d(parameters[Layout.ParameterIndex.InertiaX] * inBody.X,
-                parameters[Layout.ParameterIndex.InertiaY] * inBody.Y, parameters[Layout.ParameterIndex.InertiaZ] * inBody.Z));
+            return pose.Rotation.Rotate(new Vector3d(parameters[Word.InertiaX] * inBody.X,
+                parameters[Word.InertiaY] * inBody.Y, parameters[Word.InertiaZ] * inBody.Z));
         }
     }
 }

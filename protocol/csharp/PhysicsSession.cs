@@ -55,11 +55,11 @@ namespace TubeCosim
             get { return command.Acquire(Layout.Command.Doorbell) != number; }
         }
 
-        // Carries out the request that the doorbell announces, publishes the reply, and says whether more may come.
-        // Throws PeerViolation, or what the plant threw.
+        // Carries out the request that HasRung told of, publishes the reply, and says whether more may come. Throws
+        // PeerViolation, or what the plant threw.
         public bool Answer()
         {
-            long due = number + 1, rung = command.Acquire(Layout.Command.Doorbell);
+            long due = number + 1, rung = command.Read(Layout.Command.Doorbell);
             if (rung != due)
                 throw new PeerViolation("rang the doorbell with " + Format.Of(rung) + " where " + Format.Of(due)
                     + " was due");
@@ -197,7 +197,7 @@ namespace TubeCosim
 
         private void Publish(long due, Refusal refusal, long engineNs)
         {
-            if (command.Acquire(Layout.Command.Doorbell) != due || command.Read(Layout.Command.Begin) != due)
+            if (command.Read(Layout.Command.Doorbell) != due || command.Read(Layout.Command.Begin) != due)
                 throw new PeerViolation("wrote an early request before request " + Format.Of(due) + " was answered");
             pose.Write(Layout.Pose.Begin, due);
             pose.Fence(); // for observers: the first word before the payload

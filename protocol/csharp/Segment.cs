@@ -119,8 +119,7 @@ namespace TubeCosim
                         writable ? MemoryMappedFileRights.ReadWrite : MemoryMappedFileRights.Read;
                     return new Segment(name, null, MemoryMappedFile.OpenExisting(name, rights), access);
                 }
-                // For writing even where it is only read: a record lock needs that. Shared with its other user.
-                stream = new FileStream(name, FileMode.Open, FileAccess.ReadWrite, FileShare.ReadWrite);
+                stream = OpenStream(name);
                 long size = stream.Length;
                 if (size > 0) // a larger capacity would make the file grow
                     return new Segment(name, stream, MemoryMappedFile.CreateFromFile(
@@ -156,7 +155,7 @@ namespace TubeCosim
             string name = rendezvous.Stem + suffix;
             try
             {
-                using (FileStream file = new FileStream(name, FileMode.Open, FileAccess.ReadWrite, FileShare.ReadWrite))
+                using (FileStream file = OpenStream(name))
                 {
                     file.Lock(0, 1);
                     if (file.Length == 0)
@@ -288,6 +287,12 @@ namespace TubeCosim
             if (remove)
                 File.Delete(name);
             Dispose();
+        }
+
+        // For writing even where it is only read: a record lock needs that. Shared with its other user.
+        private static FileStream OpenStream(string path)
+        {
+            return new FileStream(path, FileMode.Open, FileAccess.ReadWrite, FileShare.ReadWrite);
         }
 
         private IntPtr Place(int offset)

@@ -3,6 +3,7 @@
 
 using System;
 using System.Runtime.InteropServices;
+using Word = TubeCosim.Layout.ParameterIndex;
 
 namespace TubeCosim
 {
@@ -52,7 +53,7 @@ namespace TubeCosim
         {
             foreach (LaneReset reset in resets)
             {
-                double gust = reset.Parameters[Layout.ParameterIndex.Gust];
+                double gust = reset.Parameters[Word.Gust];
                 if (gust != 0.0)
                     throw new Refusal("gust", "0, since this plant has no gusts", Format.Of(gust), reset.Lane);
             }
@@ -101,27 +102,27 @@ namespace TubeCosim
         private static Vector3d Accelerated(Vector3d v, Vector3d forward, ref LaneCommand command, double[] p,
             double h)
         {
-            double mass = p[Layout.ParameterIndex.Mass], drag = p[Layout.ParameterIndex.LinearDrag];
-            double gravity = p[Layout.ParameterIndex.Gravity], speed = command.Speed;
-            Vector3d a = p[Layout.ParameterIndex.ForceAlongBody] != 0.0 ? forward : command.Direction;
-            double thrust = mass * p[Layout.ParameterIndex.ForceGain];
+            double mass = p[Word.Mass], drag = p[Word.LinearDrag];
+            double gravity = p[Word.Gravity], speed = command.Speed;
+            Vector3d a = p[Word.ForceAlongBody] != 0.0 ? forward : command.Direction;
+            double thrust = mass * p[Word.ForceGain];
             double lift = command.Compensation * mass * gravity;
             return new Vector3d(
-                v.X + h * ((thrust * (speed * a.X - v.X) - drag * v.X + p[Layout.ParameterIndex.DisturbanceX])
+                v.X + h * ((thrust * (speed * a.X - v.X) - drag * v.X + p[Word.DisturbanceX])
                     / mass),
-                v.Y + h * ((thrust * (speed * a.Y - v.Y) - drag * v.Y + p[Layout.ParameterIndex.DisturbanceY])
+                v.Y + h * ((thrust * (speed * a.Y - v.Y) - drag * v.Y + p[Word.DisturbanceY])
                     / mass),
                 v.Z + h * ((thrust * (speed * a.Z - v.Z) + lift - drag * v.Z
-                    + p[Layout.ParameterIndex.DisturbanceZ]) / mass - gravity));
+                    + p[Word.DisturbanceZ]) / mass - gravity));
         }
 
         // In the body frame f = (1, 0, 0), so f x d = (0, -d_up, d_left), and the inertia is diagonal.
         private static Vector3d Turned(Vector3d o, Vector3d forward, Vector3d left, Vector3d up, Vector3d d,
             double[] p, double h)
         {
-            double ix = p[Layout.ParameterIndex.InertiaX], iy = p[Layout.ParameterIndex.InertiaY];
-            double iz = p[Layout.ParameterIndex.InertiaZ], drag = p[Layout.ParameterIndex.AngularDrag];
-            double kp = p[Layout.ParameterIndex.TorqueKp], kd = p[Layout.ParameterIndex.TorqueKd];
+            double ix = p[Word.InertiaX], iy = p[Word.InertiaY];
+            double iz = p[Word.InertiaZ], drag = p[Word.AngularDrag];
+            double kp = p[Word.TorqueKp], kd = p[Word.TorqueKd];
             double bx = Vector3d.Dot(forward, o), by = Vector3d.Dot(left, o), bz = Vector3d.Dot(up, o);
             double tx = ix * (-kd * bx) - drag * bx;
             double ty = iy * (kp * -Vector3d.Dot(up, d) - kd * by) - drag * by;

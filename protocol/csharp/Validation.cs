@@ -12,7 +12,7 @@ namespace TubeCosim
 
         public static bool IsFinite(double value)
         {
-            return Math.Abs(value) <= double.MaxValue;
+            return value - value == 0.0; // of infinities and NaN it is NaN
         }
 
         public static void CheckCommands(double[] rows, int lanes, double speedMax)

@@ -1,5 +1,5 @@
-// Answers questions of test_csharp.py: each line of stdin is a function's name and its numbers (or text), each line of
-// stdout the result's numbers.
+// Answers questions of test_csharp_unity.py: a line of stdin is a function's name and its numbers or words, a line of
+// stdout the numbers of the result.
 
 using System;
 using System.Collections.Generic;

@@ -37,6 +37,7 @@ namespace TubeCosim
         };
 
         private const float PauseS = 1f; // between two sessions
+        private const double AttachTimeoutS = 30.0; // for a player that serves one session
         private const double QuietMs = 50.0;
 
         private readonly Stopwatch clock = Stopwatch.StartNew();
@@ -55,9 +56,14 @@ namespace TubeCosim
         {
             try
             {
-                if (peer == null && clock.Elapsed.TotalSeconds >= openAt)
+                double now = clock.Elapsed.TotalSeconds;
+                if (peer == null && now >= openAt)
                     peer = new PhysicsPeer(rendezvous, new UnityPlant(speedMax, Defaults, sceneTube));
-                if (peer != null && peer.TryAttach() && AnswerForAWhile() == Turn.Closed)
+                if (peer == null)
+                    return;
+                if (!peer.TryAttach())
+                    EndIfNobodyComes(now);
+                else if (AnswerForAWhile() == Turn.Closed)
                     End("the agent said goodbye after " + Format.Of(peer.Steps) + " steps");
             }
             catch (ProtocolException error)
@@ -83,8 +89,8 @@ namespace TubeCosim
         private Turn AnswerForAWhile()
         {
             double began = clock.Elapsed.TotalMilliseconds, now = began;
-            Turn turn = Turn.Idle;
-            while (turn != Turn.Closed && now - began < frameBudgetMs)
+            Turn turn;
+            do
             {
                 turn = peer.TryAnswer();
                 now = clock.Elapsed.TotalMilliseconds;
@@ -94,8 +100,14 @@ namespace TubeCosim
                     break;
                 else
                     Thread.Yield();
-            }
+            } while (turn != Turn.Closed && now - began < frameBudgetMs);
             return turn;
+        }
+
+        private void EndIfNobodyComes(double now)
+        {
+            if (!serveAgain && now > AttachTimeoutS)
+                End("no session at " + rendezvous + " within " + Format.Of(AttachTimeoutS) + " s, found " + peer.News);
         }
 
         private void End(string how)

@@ -4,6 +4,7 @@
 using System.Collections.Generic;
 using UnityEngine;
 using UnityEngine.SceneManagement;
+using Word = TubeCosim.Layout.ParameterIndex;
 #if !UNITY_6000_0_OR_NEWER
 using PhysicsMaterial = UnityEngine.PhysicMaterial;
 #endif
@@ -122,9 +123,9 @@ namespace TubeCosim
             reset = wanted;
             PhysicsMaterial material = new PhysicsMaterial // of body and wall: Unity takes the average of both
             {
-                bounciness = (float)Parameter(Layout.ParameterIndex.Restitution),
-                dynamicFriction = (float)Parameter(Layout.ParameterIndex.Friction),
-                staticFriction = (float)Parameter(Layout.ParameterIndex.Friction),
+                bounciness = (float)Parameter(Word.Restitution),
+                dynamicFriction = (float)Parameter(Word.Friction),
+                staticFriction = (float)Parameter(Word.Friction),
             };
             built.Add(material);
             if (wall != null && sceneTube != null)
@@ -138,10 +139,10 @@ namespace TubeCosim
         public LanePose Step(LaneCommand command, int innerSteps, float h)
         {
             double[] parameters = reset.Parameters;
-            Vector3 gravity = new Vector3(0f, -(float)Parameter(Layout.ParameterIndex.Gravity), 0f);
+            Vector3 gravity = new Vector3(0f, -(float)Parameter(Word.Gravity), 0f);
             if (Physics.gravity != gravity)
                 Physics.gravity = gravity; // of all scenes; only this one is simulated until the next lane's turn
-            Vector3d gust = ForceLaw.Gust(reset.Seed, command.Step, Parameter(Layout.ParameterIndex.Gust));
+            Vector3d gust = ForceLaw.Gust(reset.Seed, command.Step, Parameter(Word.Gust));
             int contactSteps = 0;
             for (int i = 0; i < innerSteps; i++)
             {
@@ -199,14 +200,14 @@ namespace TubeCosim
             drone.transform.rotation = new Quaternion((float)rotation.X, (float)rotation.Y, (float)rotation.Z,
                 (float)rotation.W);
             SphereCollider sphere = drone.AddComponent<SphereCollider>();
-            sphere.radius = (float)Parameter(Layout.ParameterIndex.BodyRadius);
+            sphere.radius = (float)Parameter(Word.BodyRadius);
             sphere.sharedMaterial = material;
             contact = drone.AddComponent<ContactSensor>();
             body = drone.AddComponent<Rigidbody>();
-            body.mass = (float)Parameter(Layout.ParameterIndex.Mass);
+            body.mass = (float)Parameter(Word.Mass);
             body.centerOfMass = Vector3.zero;
-            body.inertiaTensor = ToUnity(Frames.Inertia(new Vector3d(Parameter(Layout.ParameterIndex.InertiaX),
-                Parameter(Layout.ParameterIndex.InertiaY), Parameter(Layout.ParameterIndex.InertiaZ))));
+            body.inertiaTensor = ToUnity(Frames.Inertia(new Vector3d(Parameter(Word.InertiaX),
+                Parameter(Word.InertiaY), Parameter(Word.InertiaZ))));
             body.inertiaTensorRotation = Quaternion.identity;
             body.useGravity = true;
             body.interpolation = RigidbodyInterpolation.None;
