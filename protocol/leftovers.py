@@ -27,10 +27,10 @@ from protocol.memory import (
     SHM_FOLDER,
     Rendezvous,
     Segment,
-    is_empty,
     is_ours,
     open_segment,
     parse_rendezvous,
+    remove_empty,
     segment_path,
 )
 from protocol.opening import CREATION_GRACE_S
@@ -106,13 +106,15 @@ def remove(rendezvous: Rendezvous) -> None:
         )
         if command is None and pose is None:
             return
+        if any(segment is not None and not segment.stands() for segment in segments):
+            raise SessionError(f"{rendezvous} was taken at this moment; left alone")
         _demand_dead(_judge(rendezvous, command, pose))
         # `.cmd` last: its lock is what a new agent asks for.
         for segment, suffix in ((segments[1], POSE_SUFFIX), (segments[0], COMMAND_SUFFIX)):
             if segment is not None:
                 segment.unlink()
-            elif is_empty(rendezvous, suffix):  # the agent died before it had given it a size
-                segment_path(rendezvous, suffix).unlink(missing_ok=True)
+            else:  # the agent may have died before it had given it a size
+                remove_empty(rendezvous, suffix)
 
 
 @dataclass(frozen=True)

@@ -135,17 +135,21 @@ class Segment:
             return False
         return True
 
+    def stands(self) -> bool:
+        """Tell whether the segment's name still stands for it, and not for a newer one or for nothing."""
+        if self.path is None:  # Windows keeps the name of shared memory for as long as anyone has it open
+            return True
+        try:
+            return os.path.samestat(os.fstat(self._descriptor), self.path.stat())
+        except FileNotFoundError:
+            return False
+
     def unlink(self) -> None:
         """Remove the segment's name, unless it is gone already or stands for a newer segment.
 
         Windows removes shared memory with its last user, and keeps the name of a file until it is closed.
         """
-        if self.path is None or self._descriptor == _CLOSED:
-            return
-        try:
-            if not os.path.samestat(os.fstat(self._descriptor), self.path.stat()):
-                return
-        except FileNotFoundError:
+        if self.path is None or self._descriptor == _CLOSED or not self.stands():
             return
         if sys.platform == "win32":
             self._remove_when_closed = True
@@ -273,6 +277,23 @@ def is_empty(rendezvous: Rendezvous, suffix: str) -> bool:
         return segment_path(rendezvous, suffix).stat().st_size == 0
     except FileNotFoundError:
         return False
+
+
+def remove_empty(rendezvous: Rendezvous, suffix: str) -> bool:
+    """Remove a segment that was never given a size, under its lock; False where none stands or it is taken."""
+    path = segment_path(rendezvous, suffix)
+    try:
+        descriptor = os.open(path, os.O_RDWR)
+    except FileNotFoundError:
+        return False
+    segment = Segment(str(path), memoryview(b""), path, descriptor, lambda: None)
+    try:
+        removable = os.fstat(descriptor).st_size == 0 and segment.lock()
+        if removable:
+            segment.unlink()
+        return removable
+    finally:
+        segment.close()
 
 
 def _map_file(name: str, path: Path, descriptor: int, size: int) -> Segment:

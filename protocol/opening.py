@@ -23,7 +23,7 @@ from protocol.memory import (
     create_segment,
     is_empty,
     open_segment,
-    segment_path,
+    remove_empty,
 )
 
 _log = logging.getLogger("protocol")
@@ -46,11 +46,14 @@ def create_segments(rendezvous: Rendezvous, lanes: int) -> Segments:
     """
     command = _create_over_stale(rendezvous, COMMAND_SUFFIX, layout.command_bytes(lanes), COMMAND_MAGIC)
     try:
-        if not command.lock():
-            raise SessionError(f"{rendezvous} was taken by another agent at this moment; use another name")
+        # Until it was locked, anyone could take it for one that was left unfinished, and replace it.
+        if not (command.lock() and command.stands()):
+            raise SessionError(
+                f"{rendezvous} was taken by another at this moment; try again or use another name"
+            )
         pose = _create_over_stale(rendezvous, POSE_SUFFIX, layout.pose_bytes(lanes), POSE_MAGIC)
     except BaseException:
-        command.unlink()
+        _remove_names(command, None)
         command.close()
         raise
     return Segments(command, pose)
@@ -82,10 +85,7 @@ def _remove_stale(rendezvous: Rendezvous, suffix: str, word: bytes, patient: boo
     foreign = f"{name} exists and is no session's segment; remove it or use another name"
     segment = open_segment(rendezvous, suffix)
     if segment is None:  # just being created, or just removed by another
-        if patient or not is_empty(rendezvous, suffix):
-            return foreign
-        segment_path(rendezvous, suffix).unlink(missing_ok=True)
-        return ""
+        return foreign if patient or not remove_empty(rendezvous, suffix) else ""
     try:
         found = magic(segment.view)
         if len(segment.view) < _HEADER_BYTES or found not in (word, _NOT_YET):
@@ -97,6 +97,11 @@ def _remove_stale(rendezvous: Rendezvous, suffix: str, word: bytes, patient: boo
                 raise SessionError(in_use)
             if (found == _NOT_YET and patient) or not segment.lock():
                 return in_use
+            if not segment.stands():
+                return ""
+            _remove_stale(
+                rendezvous, POSE_SUFFIX, POSE_MAGIC, patient=False
+            )  # first, as `_remove_names` does
         _log.warning("replacing the stale segment %s; its writer (pid %d) did not remove it", name, pid)
         segment.unlink()
     finally:
@@ -137,9 +142,33 @@ def attach_segments(rendezvous: Rendezvous, timeout: float, launcher: int | None
 
 
 def remove_if_dead(segments: Segments) -> None:
-    """Remove the segments of an agent that is dead by now, for whatever reason its physics side leaves."""
-    if _not_on_offer(segments.command) == _DEAD_AGENT:
-        segments.unlink()
+    """Remove the segments of an agent that is dead by now, for whatever reason its physics side leaves.
+
+    The dead agent's lock may outlive it for a moment, while the system clears up its threads.
+    """
+    if _not_on_offer(segments.command) != _DEAD_AGENT:
+        return
+    patience = time.monotonic() + CREATION_GRACE_S
+    while not _remove_names(segments.command, segments.pose):
+        if time.monotonic() > patience:
+            _log.warning("%s is left to the process that holds its lock", segments.command.name)
+            return
+        time.sleep(LOOK_AGAIN_S)
+
+
+def _remove_names(command: Segment, pose: Segment | None) -> bool:
+    """Remove a session's names, which no living agent needs; False where another holds the lock of `command`.
+
+    Under that lock, so that no newer names take their place in the meantime, and `command` last, so that nobody
+    finds a `.pose` without one and thinks it his to replace.
+    """
+    if not command.lock():
+        return False
+    if command.stands():
+        if pose is not None:
+            pose.unlink()
+        command.unlink()
+    return True
 
 
 def _try_attach(rendezvous: Rendezvous, patient: bool) -> tuple[Segments | None, str]:
@@ -153,19 +182,17 @@ def _try_attach(rendezvous: Rendezvous, patient: bool) -> tuple[Segments | None,
         if not is_empty(rendezvous, COMMAND_SUFFIX):
             return None, ""
         if not patient:
-            segment_path(rendezvous, COMMAND_SUFFIX).unlink(missing_ok=True)
+            remove_empty(rendezvous, COMMAND_SUFFIX)
         return None, _UNFINISHED
-    pose = open_segment(rendezvous, POSE_SUFFIX)
+    pose: Segment | None = None
     try:
         news = _not_on_offer(command)
-        abandoned = news == _DEAD_AGENT or (news == _UNFINISHED and not patient)
-        if abandoned and command.lock():
-            for segment in (pose, command):
-                if segment is not None:
-                    segment.unlink()
+        pose = open_segment(rendezvous, POSE_SUFFIX)  # after the magic: before it, this may be a dead agent's
+        if news == _DEAD_AGENT or (news == _UNFINISHED and not patient):
+            _remove_names(command, pose)
         if news:
             return None, news
-        if pose is None:
+        if pose is None or not command.stands():  # or a newer agent's
             return None, "a command segment without its pose segment"
         _claim(rendezvous, pose)
         segments = Segments(command, pose)
