@@ -4,27 +4,17 @@ from __future__ import annotations
 
 import logging
 import os
-import struct
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from protocol import handshake, layout
-from protocol.errors import (
-    PeerLost,
-    PeerViolation,
-    ProtocolError,
-    Refusal,
-    RefusalCode,
-    SessionError,
-    Verdict,
-)
+from protocol import compiled_choice, handshake, layout, requests
+from protocol.errors import PeerLost, PeerViolation, ProtocolError
 from protocol.handshake import Offer, SessionSettings
-from protocol.layout import COMMAND, POSE, Axes, Farewell, Status, read_i64, read_text
+from protocol.layout import COMMAND, POSE, Farewell, Status
 from protocol.liveness import start_time
 from protocol.memory import FENCE, parse_rendezvous
-from protocol.opening import LOOK_AGAIN_S, create_segments
+from protocol.opening import create_segments
 from protocol.plant import (
     COMMAND_WORDS,
     POSE_WORDS,
@@ -35,9 +25,13 @@ from protocol.plant import (
     ResetBatch,
     TubeReference,
 )
+from protocol.requests import Request
 from protocol.signals import held_signals
 from protocol.states import TRANSITIONS, Event, State, follow
-from protocol.waiting import LOOK_S, Peer, Waiter, Watch
+from protocol.waiting import Peer, Waiter, Watch, await_header
+
+if TYPE_CHECKING:
+    from protocol.compiled import Desk
 
 __all__ = ["AgentSession", "SessionSettings"]
 
@@ -49,13 +43,14 @@ Wait = Callable[[int, int, str], int]
 GOODBYE_S: Final = 2.0
 """How long the orderly goodbye waits for its answer."""
 
-_TUBE: Final = struct.Struct("<qqd32sq4096s")
 _READY: Final = State.READY
 _BEGIN: Final = COMMAND["begin"].word
 _REQUEST_REST_AT: Final = COMMAND["op"].offset
 _DOORBELL: Final = COMMAND["doorbell"].word
 _REPLY_AT: Final = POSE["begin"].offset
 _REPLY_DOORBELL: Final = POSE["doorbell"].word
+_DONE: Final = Status.DONE.value
+_REFUSED: Final = Status.REFUSED.value
 _NOTHING: Final = memoryview(b"")
 
 
@@ -75,10 +70,6 @@ class AgentSession:
     ) -> None:
         lanes = settings.lanes
         pid = os.getpid()
-        self.lanes = lanes
-        self.dt = settings.dt
-        self.physics_dt = settings.physics_dt
-        self.inner_steps = settings.inner_steps
         self.steps = 0
         """Control steps integrated in this session."""
         self.description: PlantDescription
@@ -91,6 +82,10 @@ class AgentSession:
         self._rendezvous = ""
         self._remove: Callable[[], None] = _remove_nothing
         self._wait: Wait
+        self._waiter: Waiter
+        self._desk: Desk | None = None
+        self.exchange = "in memory"
+        """By what steps are exchanged: "compiled" or "stdlib", and why; see `protocol.compiled_choice`."""
         self._offer = Offer(settings, os.urandom(16), pid, start_time(pid))
         self._poses = PoseBatch.zeros(lanes)
         self._pose_bytes = layout.flat_bytes(self._poses.raw, POSE_WORDS, lanes, "poses")
@@ -101,11 +96,7 @@ class AgentSession:
         keep = self._views.enter_context
         self._command, self._pose = command, keep(pose.toreadonly())  # its every byte is the physics side's
         self._words, self._reply = keep(command.cast("q")), keep(self._pose.cast("q"))
-        self._wire_commands = keep(command[layout.command_rows(lanes)])
-        self._wire_resets = keep(command[layout.reset_rows(lanes)])
-        self._wire_tube = keep(command[COMMAND["tube_index"].offset :][: _TUBE.size])
-        self._wire_tube_index = keep(self._wire_tube[:8])
-        self._wire_poses = keep(self._pose[layout.pose_rows(lanes)])
+        self._wire = requests.cut_wire(command, self._pose, lanes, keep)
         handshake.write_offer(command, self._offer)
         self._state = follow(State.ABSENT, Event.OFFER)
 
@@ -170,10 +161,16 @@ class AgentSession:
     ) -> None:
         """Wait for a physics process to attach to the session on offer; arguments and errors are those of `open`."""
         try:
-            _await_header(self._pose, self._rendezvous, watch, attach_timeout)
+            choice = compiled_choice.choose("agent", may_compile=True)  # while the physics process starts
+            await_header(self._pose, self._rendezvous, watch, attach_timeout)
             answer = handshake.read_answer(self._pose, self._offer)
             peer = Peer("physics", answer.pid, answer.started, self._pose, watch)
-            self.attached(Waiter(self._reply, _REPLY_DOORBELL, peer, reply_timeout))
+            self._waiter = Waiter(self._reply, _REPLY_DOORBELL, peer, reply_timeout)
+            self.attached(self._waiter)
+            self.exchange, speed_max = str(choice), self.description.speed_max
+            if choice.kernels is not None:
+                batches = CommandBatch.zeros(self.lanes), self._poses
+                self._desk = choice.kernels.desk(self._command, self._pose, *batches, speed_max)
         except BaseException as error:
             with held_signals():
                 self._break(error)
@@ -189,6 +186,26 @@ class AgentSession:
         self.description, self.peer_pid = answer.description, answer.pid
         self._wait = wait
         self._state = follow(self._state, Event.ATTACH)
+
+    @property
+    def lanes(self) -> int:
+        """Number of drones N."""
+        return self._offer.settings.lanes
+
+    @property
+    def dt(self) -> float:
+        """Control step (s)."""
+        return self._offer.settings.dt
+
+    @property
+    def physics_dt(self) -> float:
+        """Inner step of the physics (s)."""
+        return self._offer.settings.physics_dt
+
+    @property
+    def inner_steps(self) -> int:
+        """Inner steps of one control step."""
+        return self._offer.settings.inner_steps
 
     @property
     def engine_seconds(self) -> float:
@@ -214,7 +231,9 @@ class AgentSession:
         if commands is not self._commands:
             self._command_bytes = layout.flat_bytes(commands.raw, COMMAND_WORDS, self.lanes, "commands")
             self._commands = commands
-        self._exchange(Event.STEP, self.steps + 1, self._wire_commands, self._command_bytes, meanwhile)
+            if self._desk is not None:
+                self._desk.use_commands(commands)
+        self._exchange(requests.STEP, self.steps + 1, self._wire.commands, self._command_bytes, meanwhile)
         return self._poses
 
     def reset(self, resets: ResetBatch) -> PoseBatch:
@@ -231,7 +250,7 @@ class AgentSession:
             PeerLost, PeerViolation, SessionError: the session is over.
         """
         payload = layout.flat_bytes(resets.raw, RESET_WORDS, self.lanes, "resets")
-        self._exchange(Event.RESET, self.steps, self._wire_resets, payload)
+        self._exchange(requests.RESET, self.steps, self._wire.resets, payload)
         return self._poses
 
     def register_tube(self, index: int, tube: TubeReference) -> None:
@@ -242,7 +261,7 @@ class AgentSession:
             SessionError: the reference cannot be written down, or the session is over.
             PeerLost, PeerViolation: the session is over.
         """
-        self._exchange(Event.REGISTER_TUBE, self.steps, self._wire_tube, _pack_tube(index, tube))
+        self._exchange(requests.REGISTER_TUBE, self.steps, self._wire.tube, requests.pack_tube(index, tube))
 
     def release_tube(self, index: int) -> None:
         """Let the physics side forget a tube.
@@ -251,9 +270,8 @@ class AgentSession:
             Refusal: no such tube, or a lane still flies in it.
             PeerLost, PeerViolation, SessionError: the session is over.
         """
-        self._exchange(
-            Event.RELEASE_TUBE, self.steps, self._wire_tube_index, index.to_bytes(8, "little", signed=True)
-        )
+        payload = index.to_bytes(8, "little", signed=True)
+        self._exchange(requests.RELEASE_TUBE, self.steps, self._wire.tube_index, payload)
 
     def close(self) -> None:
         """Say goodbye and remove the segments; a peer that is lost by now is logged. Idempotent.
@@ -284,69 +302,77 @@ class AgentSession:
         if isinstance(self._wait, Waiter):
             self._wait.deadline = GOODBYE_S
         try:
-            self._exchange(Event.GOODBYE, self.steps, self._wire_tube_index, bytes(8))
+            self._exchange(requests.GOODBYE, self.steps, self._wire.tube_index, bytes(8))
         except ProtocolError as error:
             _log.warning("no orderly goodbye: %s", error)
 
     def _exchange(
         self,
-        event: Event,
+        request: Request,
         due: int,
         wire: memoryview,
         payload: memoryview | bytes,
         meanwhile: Callable[[], None] | None = None,
     ) -> None:
         """Publish a request with its payload and take in the reply, after which `due` steps are integrated."""
-        try:
-            asking = TRANSITIONS[self._state][event]
-        except KeyError:
-            asking = follow(self._state, event)  # raises what says so
-        words, before = self._words, self._number
+        if self._state is not _READY:
+            follow(self._state, request.event)  # raises what says so
+        before, desk = self._number, self._desk
         number = before + 1
-        self._state = asking
+        self._state = request.asking
         try:
             if self._reply[_REPLY_DOORBELL] != before:
                 raise PeerViolation(f"physics answered request {number} before it was made")
-            words[_BEGIN] = number
-            wire[:] = payload
-            layout.REQUEST_REST.pack_into(self._command, _REQUEST_REST_AT, event, due, number)
-            if FENCE is not None:
-                FENCE()
-            words[_DOORBELL] = number
+            engine_ns = -1
+            if desk is None or request is not requests.STEP:
+                self._publish(request.op, due, number, wire, payload)
+            else:
+                polls = self._waiter.polls * desk.polls_per_poll if meanwhile is None else 0
+                engine_ns = desk.exchange(desk.address, number, due, polls)
             if meanwhile is not None:
                 meanwhile()
-            rung = self._wait(before, due, _PHASES[event])
-            if FENCE is not None:
-                FENCE()
-            self._pose_bytes[:] = self._wire_poses
-            begin, status, step, self._engine_ns, end = layout.REPLY.unpack_from(self._pose, _REPLY_AT)
-            if not (rung == begin == end == number):
-                raise PeerViolation(_bad_reply(number, rung, begin, end))
-            if status == _DONE and step == due:
-                self.steps = due
-            elif status != _REFUSED or step != self.steps:
-                raise PeerViolation(
-                    f"physics answered request {number} with status {status} at step {step} where {due} was due"
-                )
+            if engine_ns >= 0:
+                self._engine_ns, status = engine_ns, _DONE
+            else:
+                status = self._take_reply(number, due, self._wait(before, due, request.phase))
         except BaseException as error:
             self._break(error)
             raise
         self._number = number
         if status == _DONE:
-            self._state = TRANSITIONS[asking][_DONE_EVENT]
+            self.steps, self._state = due, request.done
         else:
-            self._state = follow(asking, Event.REFUSED)
-            raise self._read_refusal()
+            self._state = follow(request.asking, Event.REFUSED)
+            raise requests.read_refusal(self._pose)
 
-    def _read_refusal(self) -> Refusal:
-        view = self._pose
-        code = read_i64(view, POSE["refusal_code"])
-        return Refusal(
-            read_text(view, POSE["refusal_field"]),
-            read_text(view, POSE["refusal_expected"]),
-            read_text(view, POSE["refusal_found"]),
-            read_i64(view, POSE["refusal_lane"]),
-            RefusalCode(code) if code in tuple(RefusalCode) else RefusalCode.PLANT,
+    def _publish(self, op: int, due: int, number: int, wire: memoryview, payload: memoryview | bytes) -> None:
+        """Write a request and ring the doorbell."""
+        words = self._words
+        words[_BEGIN] = number
+        wire[:] = payload
+        layout.REQUEST_REST.pack_into(self._command, _REQUEST_REST_AT, op, due, number)
+        if FENCE is not None:
+            FENCE()
+        words[_DOORBELL] = number
+
+    def _take_reply(self, number: int, due: int, rung: int) -> int:
+        """Copy the poses and return the status, which is done or refused.
+
+        Raises:
+            PeerViolation: the reply is not one to request `number`.
+        """
+        if FENCE is not None:
+            FENCE()
+        self._pose_bytes[:] = self._wire.poses
+        begin, status, step, self._engine_ns, end = layout.REPLY.unpack_from(self._pose, _REPLY_AT)
+        if not (rung == begin == end == number):
+            raise PeerViolation(requests.fault_of_reply(number, rung, begin, end))
+        if status == _DONE and step == due:
+            return _DONE
+        if status == _REFUSED and step == self.steps:
+            return _REFUSED
+        raise PeerViolation(
+            f"physics answered request {number} with status {status} at step {step} where {due} was due"
         )
 
     def _break(self, error: BaseException) -> None:
@@ -357,53 +383,5 @@ class AgentSession:
         self._state = follow(self._state, events.get(type(error), Event.FAREWELL))
 
 
-_PHASES: Final = {event: event.name.lower() for event in Event}
-_DONE: Final = Status.DONE.value
-_REFUSED: Final = Status.REFUSED.value
-_DONE_EVENT: Final = Event.DONE
-
-
 def _remove_nothing() -> None:
     """A session in memory has no names to remove."""
-
-
-def _bad_reply(number: int, rung: int, begin: int, end: int) -> str:
-    if rung != number:
-        return f"physics rang its doorbell with {rung} where {number} was due"
-    return f"physics published a torn reply: begin {begin}, end {end} where {number} was due"
-
-
-def _pack_tube(index: int, tube: TubeReference) -> bytes:
-    """Write a tube registration as it stands on the wire."""
-    path, most = tube.path.encode(), COMMAND["tube_path"].count
-    if tube.axes not in Axes.__members__:
-        raise SessionError(f"axes of tube {index}: expected zup or yup, found {tube.axes!r}")
-    if not 1 <= len(path) <= most:
-        raise SessionError(f"path of tube {index}: expected 1 to {most} bytes, found {len(path)}")
-    try:
-        digest = bytes.fromhex(tube.sha256)
-    except ValueError:
-        digest = b""
-    if len(digest) != COMMAND["tube_sha256"].count:
-        raise SessionError(f"sha256 of tube {index}: expected 64 hexadecimal digits, found {tube.sha256!r}")
-    return _TUBE.pack(index, Axes[tube.axes], tube.scale, digest, len(path), path)
-
-
-def _await_header(pose: memoryview, rendezvous: str, watch: Watch | None, timeout: float) -> None:
-    """Wait until the physics side's magic stands."""
-    peer = Peer("physics", 0, 0, pose, watch)
-    began = look_at = time.monotonic()
-    while handshake.magic(pose) == bytes(8):
-        now = time.monotonic()
-        if now >= look_at:
-            peer.check(0, "attach")
-            look_at = now + LOOK_S
-        if now - began > timeout:
-            raise PeerLost(
-                "physics",
-                f"nobody attached to {rendezvous} within {timeout} s; is the physics process started with this name?",
-                Verdict.TOO_SLOW,
-                0,
-                "attach",
-            )
-        time.sleep(LOOK_AGAIN_S / 5)

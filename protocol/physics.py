@@ -6,11 +6,11 @@ import os
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from protocol import handshake, layout, validation
+from protocol import compiled_choice, handshake, layout, validation
 from protocol.errors import PeerViolation, Refusal, RefusalCode
 from protocol.handshake import Answer
 from protocol.layout import COMMAND, POSE, Axes, Op, Status, read_i64
@@ -31,6 +31,9 @@ from protocol.plant import (
 from protocol.states import Event, State, follow
 from protocol.waiting import Peer, Waiter
 
+if TYPE_CHECKING:
+    from protocol.compiled import Desk, Kernels
+
 _STEP: Final = Op.STEP.value
 _DONE: Final = Status.DONE.value
 _READY: Final = State.READY
@@ -40,6 +43,7 @@ _REQUEST_AT: Final = COMMAND["begin"].offset
 _REPLY_BEGIN: Final = POSE["begin"].word
 _REPLY_REST_AT: Final = POSE["status"].offset
 _REPLY_DOORBELL: Final = POSE["doorbell"].word
+_EARLY: Final = "wrote an early request before request {} was answered"
 
 
 def serve(rendezvous: str, plant: Plant, attach_timeout: float = 30.0, launcher: int | None = None) -> None:
@@ -72,11 +76,14 @@ def _serve_attached(command: memoryview, pose: memoryview, plant: Plant) -> None
     with ExitStack() as views:
         command = views.enter_context(command.toreadonly())  # its every byte is the agent's
         try:
-            session = views.enter_context(PhysicsSession(command, pose, plant))
+            choice = compiled_choice.choose("physics", may_compile=False)
+            session = views.enter_context(PhysicsSession(command, pose, plant, choice.kernels))
             offer = session.offer
             words = views.enter_context(command.cast("q"))
             wait = Waiter(words, _DOORBELL, Peer("agent", offer.pid, offer.started, command))
-            while session.answer(wait(session.number, session.steps, "idle")):
+            while session.answer_at_once(wait.polls) or session.answer(
+                wait(session.number, session.steps, "idle")
+            ):
                 pass
         except BaseException as error:
             handshake.part(pose, error, command)
@@ -92,7 +99,9 @@ class PhysicsSession:
         HandshakeError: a field of the agent's header, or a segment's size, is not as expected.
     """
 
-    def __init__(self, command: memoryview, pose: memoryview, plant: Plant) -> None:
+    def __init__(
+        self, command: memoryview, pose: memoryview, plant: Plant, kernels: Kernels | None = None
+    ) -> None:
         self.offer = handshake.read_offer(command)
         """What the agent asks of the session."""
         settings = self.offer.settings
@@ -130,6 +139,9 @@ class PhysicsSession:
         self._wire_commands = keep(command[layout.command_rows(lanes)])
         self._wire_resets = keep(command[layout.reset_rows(lanes)])
         self._wire_poses = keep(pose[layout.pose_rows(lanes)])
+        self._desk: Desk | None = None
+        if kernels is not None:
+            self._desk = kernels.desk(command, pose, self._commands, self._poses, self._speed_max)
 
     def __enter__(self) -> PhysicsSession:
         return self
@@ -139,7 +151,36 @@ class PhysicsSession:
 
     def close(self) -> None:
         """Give up every view of the segments; idempotent."""
+        self._desk = None
         self._views.close()
+
+    def answer_at_once(self, polls: int) -> bool:
+        """Answer the next request by machine code, if there is some, and if it is a sound step that comes at once.
+
+        Returns False, and has done nothing, where there is something else to do or to say: `answer` does it.
+
+        Args:
+            polls: how long to wait for the doorbell, in polls of a Waiter.
+
+        Raises:
+            PeerViolation: the agent broke the protocol.
+            Exception: whatever the plant raised.
+        """
+        desk = self._desk
+        if desk is None or not self._all_reset or self._state is not _READY:
+            return False
+        number, step = self.number + 1, self.steps + 1
+        if not desk.take(desk.address, number, step, polls * desk.polls_per_poll):
+            return False
+        try:
+            engine_ns = self._integrate()
+        except Refusal as refusal:
+            self._publish_refusal(refusal, number)
+            return True
+        if not desk.publish(desk.address, number, step, engine_ns):
+            raise PeerViolation(_EARLY.format(number))
+        self.number, self.steps = number, step
+        return True
 
     def answer(self, rung: int) -> bool:
         """Carry out the request whose doorbell shows `rung`, publish the reply, and return whether more may come.
@@ -164,15 +205,19 @@ class PhysicsSession:
             raise PeerViolation(f"{how} a step: asked for step {step} where {self.steps + 1} was due")
         try:
             self._check_commands()
-            began = time.perf_counter_ns()
-            self._plant.step(self._commands, self._poses)
-            engine_ns = time.perf_counter_ns() - began
+            engine_ns = self._integrate()
         except Refusal as refusal:
             self._publish_refusal(refusal, number)
         else:
             self.steps = step
             self._publish(_DONE, engine_ns, number)
         return True
+
+    def _integrate(self) -> int:
+        """Take one control step and return how long that took (ns)."""
+        began = time.perf_counter_ns()
+        self._plant.step(self._commands, self._poses)
+        return time.perf_counter_ns() - began
 
     def _check_commands(self) -> None:
         """Raise the Refusal of the first lane that may not be stepped."""
@@ -188,7 +233,7 @@ class PhysicsSession:
         """Publish the reply to request `number`, the private poses with it."""
         words, reply = self._words, self._reply
         if words[_DOORBELL] != number or words[_BEGIN] != number:
-            raise PeerViolation(f"wrote an early request before request {number} was answered")
+            raise PeerViolation(_EARLY.format(number))
         reply[_REPLY_BEGIN] = number
         self._wire_poses[:] = self._pose_bytes
         layout.REPLY_REST.pack_into(self._pose, _REPLY_REST_AT, status, self.steps, engine_ns, number)

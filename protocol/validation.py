@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Container
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -20,6 +21,9 @@ UNIT_TOLERANCE: Final = 1e-6
 """How far the squared length of a direction or a quaternion may be from 1."""
 COMPENSATION_MAX: Final = 2.0
 
+_FEW_LANES: Final = 20
+_ROUNDING: Final = 1e-12
+"""More than sums of three squares near 1 differ by, in whatever order they are added."""
 _ROW: Final = struct.Struct("<5d3q")
 assert _ROW.size == COMMAND_STRIDE
 
@@ -38,43 +42,62 @@ _EITHER: Final = [i for i, p in enumerate(PARAMETERS) if p.either]
 
 
 def command_check(commands: CommandBatch, speed_max: float) -> Callable[[], bool]:
-    """Make the quick check of a session's one batch of commands: whether all of it may be integrated.
+    """Make the quick check of a session's one batch of commands: True only if all of it may be integrated.
 
-    A single lane is checked on scalars, which takes a twentieth of the time that arrays of one row take.
+    A few lanes are checked on scalars, for arrays of a few rows take as long as arrays of fifty. That of many is
+    narrower than the true bounds by rounding, since arrays add up in another order; what it does not take is
+    judged by `command_refusal`, row by row.
     """
-    if len(commands.raw) == 1:
-        row = commands.raw.data.cast("B")
-        return lambda: one_command_is_sound(row, speed_max)
-    direction, reserved = commands.direction, commands.raw.view(np.int64)[:, 5:]
-    checked = np.empty((len(commands.raw), 3))
-    squared_length, speed_and_compensation = checked[:, 0], checked[:, 1:]
-    lowest = np.array([1.0 - UNIT_TOLERANCE, 0.0, 0.0])
-    highest = np.array([1.0 + UNIT_TOLERANCE, speed_max, COMPENSATION_MAX])
+    lanes = len(commands.raw)
+    if lanes <= _FEW_LANES:
+        return partial(commands_are_sound, commands.raw.data.cast("B"), speed_max)
+    columns = np.empty((9, lanes))  # direction, its squared length, speed, compensation, reserved words
+    direction, squared_length, bounded, reserved = columns[:3], columns[3], columns[3:6], columns[6:]
+    sent_direction, sent_others = commands.raw.T[:3], commands.raw.T[3:]
+    narrow = UNIT_TOLERANCE - _ROUNDING
+    lowest = np.repeat([[1.0 - narrow], [0.0], [0.0]], lanes, axis=1)
+    highest = np.repeat([[1.0 + narrow], [speed_max], [COMPENSATION_MAX]], lanes, axis=1)
+    not_too_low, not_too_high = np.empty((2, 3, lanes), dtype=bool)
+    all_true, all_zero = bytes([True]) * not_too_low.size, bytes(reserved.nbytes)
 
     def all_are_sound() -> bool:
-        np.einsum("ij,ij->i", direction, direction, out=squared_length)
-        speed_and_compensation[...] = commands.raw[:, 3:5]
-        in_range = (checked >= lowest) & (checked <= highest)
-        return bool(in_range.all()) and not np.count_nonzero(reserved)
+        direction[...] = sent_direction
+        columns[4:] = sent_others
+        np.einsum("ij,ij->j", direction, direction, out=squared_length)
+        np.greater_equal(bounded, lowest, out=not_too_low)
+        np.less_equal(bounded, highest, out=not_too_high)
+        # Bytes compare in a tenth of the time that numpy's reductions take.
+        return (
+            not_too_low.tobytes() == all_true
+            and not_too_high.tobytes() == all_true
+            and reserved.tobytes() == all_zero
+        )
 
     return all_are_sound
 
 
-def one_command_is_sound(row: memoryview, speed_max: float) -> bool:
-    """Whether a single command row may be integrated; NaN fails every comparison."""
-    x, y, z, speed, compensation, reserved, reserved_1, reserved_2 = _ROW.unpack(row)
-    return (
-        -UNIT_TOLERANCE <= x * x + y * y + z * z - 1.0 <= UNIT_TOLERANCE
-        and 0.0 <= speed <= speed_max
-        and 0.0 <= compensation <= COMPENSATION_MAX
-        and not (reserved | reserved_1 | reserved_2)
-    )
+def commands_are_sound(rows: memoryview, speed_max: float) -> bool:
+    """Whether command rows may be integrated, exactly; NaN fails every comparison.
+
+    Args:
+        rows: bytes of whole command rows.
+        speed_max: the plant's limit (m/s).
+    """
+    for x, y, z, speed, compensation, reserved, reserved_1, reserved_2 in _ROW.iter_unpack(rows):
+        if not (
+            -UNIT_TOLERANCE <= x * x + y * y + z * z - 1.0 <= UNIT_TOLERANCE
+            and 0.0 <= speed <= speed_max
+            and 0.0 <= compensation <= COMPENSATION_MAX
+            and not (reserved | reserved_1 | reserved_2)
+        ):
+            return False
+    return True
 
 
 def command_refusal(commands: CommandBatch, speed_max: float) -> Refusal | None:
     """Return what is wrong with the first unsound command."""
     for lane, row in enumerate(commands.raw):
-        if one_command_is_sound(row.data.cast("B"), speed_max):
+        if commands_are_sound(row.data.cast("B"), speed_max):
             continue
         return (
             _unit("direction", row[:3], lane)

@@ -14,12 +14,17 @@ from dataclasses import dataclass
 from typing import Final
 
 from protocol.errors import HandshakeError, PeerLost, ProtocolError, SessionError, Verdict
-from protocol.handshake import read_farewell
+from protocol.handshake import magic, read_farewell
 from protocol.layout import Farewell
 from protocol.liveness import Life, how_ended, life
+from protocol.memory import FENCE
 
-POLLS: Final = 50
-"""Polls of the doorbell before the first yield, about 2 us."""
+POLLS: Final = 200
+"""Polls of the doorbell before the first yield, about 8 us."""
+IN_VAIN: Final = 3
+"""Waits in a row whose polling was in vain, after which waits yield at once."""
+TRIAL: Final = 256
+"""Every so many waits that yield at once, one polls all the same: the peer may have got a core of its own."""
 YIELDING_S: Final = 0.05
 """How long a wait without progress yields before it begins to sleep."""
 LOOK_S: Final = 0.03
@@ -31,9 +36,6 @@ EXIT_NEWS_S: Final = 0.05
 
 Watch = Callable[[], str | None]
 """A launcher's own view of the peer's process: None while it lives, else how it ended."""
-
-Spin = Callable[[memoryview, int, int, int], int]
-"""A short wait: (words, index, old, polls) -> the word's value when it changed or when the polls were used up."""
 
 
 def spin(words: memoryview, index: int, old: int, polls: int) -> int:
@@ -111,8 +113,8 @@ def farewell_error(who: str, reason: int, text: str, step: int, phase: str) -> P
 class Waiter:
     """Waits for the peer's next doorbell; one for each side of a session.
 
-    It learns whether the peer shares this core: where the answer is there after the first yield, polling
-    only kept the peer from running, and the next wait yields at once.
+    It learns whether polling is of use: where it was in vain a few times in a row, the peer shares this core and was
+    only kept from running, or it takes longer than that. Then waits yield at once, but for a trial now and then.
     """
 
     def __init__(self, words: memoryview, doorbell: int, peer: Peer, deadline: float | None = None) -> None:
@@ -121,9 +123,10 @@ class Waiter:
         """Longest wait (s), or None: as long as the peer lives."""
         self._words = words
         self._doorbell = doorbell
-        self._polls = POLLS
-        self.spin: Spin = spin
-        """What polls; a compiled one may take its place."""
+        self.polls = POLLS
+        """Polls of the next wait before its first yield."""
+        self._in_vain = 0
+        self._last_in_vain = -1
 
     def __call__(self, old: int, step: int, phase: str) -> int:
         """Return the doorbell's value as soon as it is not `old` any more; `step`, `phase` are for messages.
@@ -131,16 +134,15 @@ class Waiter:
         Raises:
             PeerLost, SessionError, HandshakeError: the peer died, left, or passed the deadline.
         """
-        value = self.spin(self._words, self._doorbell, old, self._polls)
+        value = spin(self._words, self._doorbell, old, self.polls)
         if value != old:
             return value
+        self._in_vain = self._in_vain + 1 if old == self._last_in_vain + 1 else 1
+        self._last_in_vain = old
+        self.polls = POLLS if self._in_vain < IN_VAIN or self._in_vain % TRIAL == 0 else 1
         give_way()
         value = self._words[self._doorbell]
-        if value != old:
-            self._polls = 1
-            return value
-        self._polls = POLLS
-        return self._wait_long(old, step, phase)
+        return value if value != old else self._wait_long(old, step, phase)
 
     def _wait_long(self, old: int, step: int, phase: str) -> int:
         words, doorbell = self._words, self._doorbell
@@ -178,3 +180,29 @@ class Waiter:
                 step,
                 phase,
             )
+
+
+def await_header(pose: memoryview, rendezvous: str, watch: Watch | None, timeout: float) -> None:
+    """Wait until the physics side's magic stands.
+
+    Raises:
+        PeerLost, SessionError, HandshakeError: it left, died, or did not attach within `timeout` seconds.
+    """
+    peer = Peer("physics", 0, 0, pose, watch)
+    began = look_at = time.monotonic()
+    while magic(pose) == bytes(8):
+        now = time.monotonic()
+        if now >= look_at:
+            peer.check(0, "attach")
+            look_at = now + LOOK_S
+        if now - began > timeout:
+            raise PeerLost(
+                "physics",
+                f"nobody attached to {rendezvous} within {timeout} s; is the physics process started with this name?",
+                Verdict.TOO_SLOW,
+                0,
+                "attach",
+            )
+        time.sleep(NAP_MIN_S)
+    if FENCE is not None:
+        FENCE()

@@ -91,11 +91,25 @@ def test_learning_libraries_stay_in_the_learning_files() -> None:
 
 
 def test_protocol_needs_the_standard_library_and_numpy_alone() -> None:
-    """A stranger can use the protocol package with nothing installed but numpy."""
+    """The protocol package works with nothing installed but numpy; one file of it may use numba."""
     for path in files_of("protocol"):
+        allowed = {"numpy", "protocol"}
+        if path == ROOT / "protocol/compiled.py":
+            allowed |= {"numba", "llvmlite"}
         for name in imported_modules(path):
             top = name.split(".")[0]
-            assert top in sys.stdlib_module_names or top in {"numpy", "protocol"}, f"{path} imports {name}"
+            assert top in sys.stdlib_module_names or top in allowed, f"{path} imports {name}"
+
+
+def test_importing_the_sessions_loads_no_compiler() -> None:
+    """The file with the machine code is imported when a session asks for it, and not before."""
+    code = (
+        "import sys, protocol.agent, protocol.physics, protocol.twin\n"
+        "print({'numba', 'llvmlite'} & set(sys.modules))"
+    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT, timeout=60)
+    assert done.stdout.strip() == "set()", done.stdout + done.stderr
 
 
 def test_no_package_under_tests() -> None:
