@@ -12,6 +12,7 @@ import pytest
 from csharp import (
     DT,
     INNER_STEPS,
+    MONO,
     PATIENCE_S,
     Serve,
     build,
@@ -136,7 +137,7 @@ def test_the_server_says_what_is_wrong_with_its_command_line(server: Path) -> No
     """No rendezvous, or one that is none, is answered with what was expected."""
     for arguments, status, words in ((["shm:.x"], 3, "found shm:.x"), ([], 2, "usage:")):
         done = subprocess.run(
-            ["mono", str(server), *arguments], capture_output=True, text=True, check=False, timeout=30
+            [*MONO.split(), str(server), *arguments], capture_output=True, text=True, check=False, timeout=30
         )
         assert done.returncode == status
         assert words in done.stderr
@@ -144,7 +145,7 @@ def test_the_server_says_what_is_wrong_with_its_command_line(server: Path) -> No
 
 def test_the_shipped_policy_flies_the_shipped_conduit(server: Path, name: str, tmp_path: Path) -> None:
     """`cosim launch --connect` against the C# server succeeds, says that it judges contact itself, leaves nothing."""
-    with subprocess.Popen(["mono", str(server), f"shm:{name}"]) as process:
+    with subprocess.Popen([*MONO.split(), str(server), f"shm:{name}"]) as process:
         try:
             done = run_cosim("launch", "--json", "--connect", f"shm:{name}", "--out", "run", cwd=tmp_path)
             assert done.status == 0, done.stderr

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from csharp import (
+    MONO,
     SOURCES,
     Floats,
     build,
@@ -79,7 +80,7 @@ def ask(checks: Path) -> Ask:
 
     def run(*questions: str) -> list[Floats]:
         done = subprocess.run(
-            ["mono", str(checks)],
+            [*MONO.split(), str(checks)],
             input="".join(f"{question}\n" for question in questions),
             capture_output=True,
             text=True,
@@ -224,7 +225,7 @@ def test_a_wall_that_cannot_be_read_is_refused(
         mesh.write_text(content)
     sha256 = hashlib.sha256((content or "").encode()).hexdigest() if field == "tube_path" else "00" * 32
     done = subprocess.run(
-        ["mono", str(checks)],
+        [*MONO.split(), str(checks)],
         input=f"mesh zup 1.0 {sha256} {mesh}\n",
         capture_output=True,
         text=True,
