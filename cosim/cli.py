@@ -28,7 +28,21 @@ _SEED: Final = click.IntRange(0, 2**31)
 CONTEXT: Final = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 
 
-@click.group(context_settings=CONTEXT)
+class _Commands(click.Group):
+    """All the commands; where nobody reads their output any more they end as SIGPIPE would end them."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command. Of a closed pipe click would make 1, which means "no success" here."""
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError as error:
+            os.dup2(
+                os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+            )  # Python flushes once more at its exit
+            sys.exit(exit_status(error))
+
+
+@click.group(cls=_Commands, context_settings=CONTEXT)
 @click.version_option(__version__, prog_name="cosim")
 def cosim() -> None:
     """Fly a learned drone policy through a tube, in lockstep with a physics engine.

@@ -39,7 +39,7 @@ from cosim.live import LiveLine
 from cosim.options import SHIPPED_MESH, SHIPPED_POLICY, FlightOptions
 from cosim.pilots import SHIPPED_CHECKPOINT, Pilot, PilotChoice, Terms, choose_pilot, read_pilot
 from cosim.recording import MANIFEST, Recorder
-from cosim.sessions import physics_session, rendezvous_of
+from cosim.sessions import attached_session, offered_session, rendezvous_of
 from cosim.supervise import PhysicsProcess, physics_command
 from cosim.versions import versions
 from meshes.tube import INDUSTRIAL
@@ -114,6 +114,12 @@ def launch(
         say(note)
     with ExitStack() as stack:
         folder = stack.enter_context(new_folder(options.out, _label(options, mesh, choice)))
+        pilot = read_pilot(choice, Terms(options.dt, options.allow_mismatch, conditions.drone))
+        # On offer before the physics process starts: a second launch of the same name never starts one, which
+        # might serve this session.
+        offer = stack.enter_context(
+            offered_session(rendezvous, SessionSettings(1, pilot.dt, options.physics_dt))
+        )
         process = None
         if command is None:
             say(f"waiting for a physics peer at {rendezvous} (at most {options.attach_timeout:g} s)")
@@ -125,12 +131,10 @@ def launch(
             stack.callback(_forget_unflown, folder)
         else:
             conduit = read_conduit(options, mesh)
-        pilot = read_pilot(choice, Terms(options.dt, options.allow_mismatch, conditions.drone))
         for note in (*pilot.notes, *conditions.notes):
             say(note)
-        settings = SessionSettings(1, pilot.dt, options.physics_dt)
         session = stack.enter_context(
-            physics_session(rendezvous, settings, process=process, attach_timeout=options.attach_timeout)
+            attached_session(offer, process=process, attach_timeout=options.attach_timeout)
         )
         plant = session.description
         say(f"physics: {plant.name} {plant.version}, engine {plant.engine}")

@@ -15,6 +15,7 @@ from cosim.errors import CosimError
 from cosim.supervise import PhysicsProcess, physics_command
 from protocol.agent import AgentSession, SessionSettings
 from protocol.errors import ProtocolError
+from protocol.signals import held_signals
 
 Engine = Literal["bullet", "reference"]
 
@@ -42,28 +43,40 @@ def rendezvous_of(connect: str | None, name: str | None, transport: str) -> str:
 
 
 @contextmanager
-def physics_session(
-    rendezvous: str,
-    settings: SessionSettings,
-    *,
-    process: PhysicsProcess | None,
-    attach_timeout: float,
+def offered_session(rendezvous: str, settings: SessionSettings) -> Iterator[AgentSession]:
+    """A session on offer, for which a physics process can be started: its name is nobody else's from now on.
+
+    Raises:
+        SessionError: the rendezvous is taken or cannot be used, or there is no room.
+    """
+    session: AgentSession | None = None
+    try:
+        with held_signals():  # Ctrl-C comes before the segments are there, or when they will be removed
+            session = AgentSession.offer(rendezvous, settings)
+        yield session
+    finally:
+        if session is not None:
+            session.close()
+
+
+@contextmanager
+def attached_session(
+    offer: AgentSession, *, process: PhysicsProcess | None, attach_timeout: float
 ) -> Iterator[AgentSession]:
-    """An open session with a physics process.
+    """A session with the physics process that takes up the offer; it is closed before that process is.
 
     Args:
-        rendezvous: where the two sides meet.
-        settings: lanes and time steps.
+        offer: the session on offer.
         process: ours to watch; None for a peer that somebody else starts.
         attach_timeout: patience for the peer's attach (s).
 
     Raises:
-        ProtocolError: the session could not be opened, or failed while it was used; the last lines that the
-            process wrote to its stderr are added as a note.
+        ProtocolError: nobody attached, or the session failed while it was used; the last lines that the process
+            wrote to its stderr are added as a note.
     """
-    watch = None if process is None else process.watch
     try:
-        with AgentSession.open(rendezvous, settings, watch=watch, attach_timeout=attach_timeout) as session:
+        with offer as session:
+            session.await_physics(None if process is None else process.watch, attach_timeout)
             if process is not None:
                 process.serving = True
             yield session
@@ -71,6 +84,26 @@ def physics_session(
         if process is not None and (words := process.last_words()):
             error.add_note(f"the physics process said: {words}")
         raise
+
+
+@contextmanager
+def physics_session(
+    rendezvous: str,
+    settings: SessionSettings,
+    *,
+    process: PhysicsProcess | None,
+    attach_timeout: float,
+) -> Iterator[AgentSession]:
+    """An open session with a physics process that is there already, at a rendezvous that nobody else knows.
+
+    Raises:
+        ProtocolError: as `offered_session` and `attached_session`.
+    """
+    with (
+        offered_session(rendezvous, settings) as offer,
+        attached_session(offer, process=process, attach_timeout=attach_timeout) as session,
+    ):
+        yield session
 
 
 @contextmanager

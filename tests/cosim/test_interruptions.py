@@ -1,0 +1,163 @@
+"""Launches that are disturbed while they start or while they speak: quiet ends, and nothing of them is left."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from flights import DEADLINE, ROOT, Done, command, environment, leftovers
+
+from cosim.runs import read_run
+from protocol.leftovers import leftovers as dead_sessions
+from protocol.leftovers import remove
+from protocol.memory import Rendezvous
+
+IMPORTING = """
+import sys, time
+from importlib.abc import MetaPathFinder
+
+class Slow(MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == "cosim.cli":
+            print("importing", flush=True)
+            time.sleep(60)
+
+from cosim.__main__ import main
+sys.meta_path.insert(0, Slow())
+main()
+"""
+
+
+def start(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
+    """Start `cosim`, for which Ctrl-C is not ignored as it is for a shell's jobs in the background."""
+    return subprocess.Popen(
+        command(*arguments),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=cwd,
+        env=environment(),
+    )
+
+
+def finish(process: subprocess.Popen[str]) -> Done:
+    """Wait for the end."""
+    try:
+        stdout, stderr = process.communicate(timeout=DEADLINE)
+    finally:
+        process.kill()
+    return Done(process.returncode, stdout, stderr)
+
+
+def test_of_two_launches_of_one_name_the_first_flies_on(session_name: str, tmp_path: Path) -> None:
+    """Started at the same moment: one flies undisturbed, the other ends with one sentence and leaves nothing."""
+    flown = [
+        start(
+            *("launch", "--session", session_name, "--out", str(tmp_path / which)),
+            *("--max-steps", "20", "--realtime", "2"),
+            cwd=tmp_path,
+        )
+        for which in ("one", "other")
+    ]
+    done = [finish(process) for process in flown]
+    assert sorted(each.status for each in done) == [0, 2], done
+    winner, loser = sorted(done, key=lambda each: each.status)
+    pid = flown[done.index(winner)].pid
+    taken = rf"shm:{session_name} belongs to a session whose agent \(pid {pid}\) is alive; use another name"
+    assert re.fullmatch(f"cosim: {taken}\n", loser.stderr), loser.stderr
+    left = [path.name for path in tmp_path.iterdir()]
+    assert left == [("one", "other")[done.index(winner)]]
+    assert read_run(tmp_path / left[0]).manifest["status"] == "completed"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_while_the_command_is_imported_is_quiet(number: signal.Signals) -> None:
+    """From the first line of the console script on: the status of the signal and not a word."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", IMPORTING], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "importing\n"
+    process.send_signal(number)
+    done = finish(process)
+    assert (done.status, done.stderr) == (128 + number, "")
+
+
+def test_ctrl_c_at_any_moment_of_the_start_leaves_nothing(session_name: str, tmp_path: Path) -> None:
+    """Between the first import and the first step: status 130, no traceback, no process, no segment, no folder."""
+    for moment in (0.15, 0.35, 0.55, 0.8):
+        process = start("launch", "--session", session_name, "--realtime", "1", cwd=tmp_path)
+        time.sleep(moment)
+        process.send_signal(signal.SIGINT)
+        done = finish(process)
+        assert done.status == 130, done
+        assert "Traceback" not in done.stderr
+        assert leftovers(session_name) == []
+        assert processes_with(session_name) == []
+        for run in tmp_path.glob("runs/*"):  # a flight that had begun by then is kept
+            assert read_run(run).manifest["status"] == "interrupted"
+
+
+def processes_with(text: str) -> list[str]:
+    """Command lines that contain a text."""
+    lines = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            lines.append(path.read_bytes().replace(b"\0", b" ").decode(errors="replace"))
+        except OSError:
+            continue
+    return [line for line in lines if text in line]
+
+
+@pytest.mark.parametrize(("lines", "flies"), [(1, False), (4, True)])
+def test_a_reader_that_leaves_ends_the_command(
+    session_name: str, tmp_path: Path, lines: int, flies: bool
+) -> None:
+    """`cosim launch | head`: ended as by SIGPIPE, before the flight or after it; no half of a run is left."""
+    process = start("launch", "--session", session_name, "--out", "run", "--max-steps", "5", cwd=tmp_path)
+    assert process.stdout is not None
+    for _ in range(lines):
+        assert process.stdout.readline()
+    process.stdout.close()
+    assert process.stderr is not None
+    with process.stderr as stderr:
+        said = stderr.read()
+    assert (process.wait(DEADLINE), said) == (141, "")
+    assert leftovers(session_name) == []
+    assert processes_with(session_name) == []
+    assert [path.name for path in tmp_path.iterdir()] == (["run"] if flies else [])
+    if flies:
+        assert read_run(tmp_path / "run").manifest["status"] == "completed"
+
+
+def test_what_a_killed_launch_left_without_physics_is_known_as_dead(
+    session_name: str, tmp_path: Path
+) -> None:
+    """--connect, nobody came, kill -9: its segments stay until somebody looks, and `cosim doctor --clean` will."""
+    process = start("launch", "--connect", session_name, cwd=tmp_path)
+    wait_until(lambda: len(leftovers(session_name)) == 2)
+    process.kill()
+    finish(process)
+    # One that was killed before its header stood is given up half a second later.
+    wait_until(lambda: bool(dead_of(session_name)))
+    (dead,) = dead_of(session_name)
+    remove(dead)
+
+
+def dead_of(session: str) -> list[Rendezvous]:
+    """The names of dead sessions that contain that of a session."""
+    return [one.rendezvous for one in dead_sessions() if session in str(one.rendezvous)]
+
+
+def wait_until(holds: Callable[[], bool]) -> None:
+    """Poll until something holds, or fail at the deadline."""
+    deadline = time.monotonic() + DEADLINE
+    while not holds():
+        assert time.monotonic() < deadline, "deadline passed"
+        time.sleep(0.02)
