@@ -54,12 +54,13 @@ def reply_numbers(rig: Rig) -> None:
 def step_count(rig: Rig) -> None:
     """Steps add one; resets and refusals leave it, over all episodes."""
     agent = rig.open()
-    counts = []
-    for _ in range(2):
-        counts.append(agent.reset(resets(agent)).step)
-        counts += [agent.step(commands(agent)).step for _ in range(3)]
-        counts.append(release(agent, 0).step)
-    expect("step of each reply", counts, [0, 1, 2, 3, 3, 3, 4, 5, 6, 6])
+    for before in (0, 3):
+        expect("step of the reply to a reset", agent.reset(resets(agent)).step, before)
+        for step in (1, 2, 3):
+            expect(
+                f"step of the reply to step {before + step}", agent.step(commands(agent)).step, before + step
+            )
+        expect("step of the reply to a refused request", release(agent, 0).step, before + 3)
 
 
 @server_rule(
@@ -106,16 +107,17 @@ def silent_between_requests(rig: Rig) -> None:
 
 @server_rule("reply-whole-at-doorbell", Level.CORE, "11", "a reply is whole when its doorbell rings")
 def reply_whole_at_doorbell(rig: Rig) -> None:
-    """What stands when the doorbell shows stays as it is, for a step and for a refusal."""
+    """What stands when the doorbell shows stays as it is, for a reset, a step and a refusal."""
     agent = rig.open()
-    done(agent.reset(resets(agent, gravity=9.81)), "a reset")
-    for compensation in (0.0, 3.0):  # the second is refused
+    agent.put_resets(resets(agent, gravity=9.81))
+    for op, compensation in ((Op.RESET, 0.0), (Op.STEP, 0.0), (Op.STEP, 3.0)):  # the last is refused
         agent.put_commands(commands(agent, compensation=compensation))
-        agent.request(Op.STEP)
-        agent.await_reply()
+        agent.request(op)
+        agent.await_bell()
         seen = bytes(agent.pose)
         time.sleep(_MOMENT_S)
-        _same_bytes("the pose segment after the doorbell rang", bytes(agent.pose), seen)
+        _same_bytes(f"the pose segment after the doorbell rang for a {op.name}", bytes(agent.pose), seen)
+        agent.await_reply()
 
 
 @server_rule("command-segment-untouched", Level.CORE, "2", "the server never writes into the agent's segment")

@@ -5,16 +5,17 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import struct
 import sys
 import time
 from typing import Final
 
 from protocol import handshake, layout
 from protocol.conformance.raw_agent import RawAgent, Value
-from protocol.conformance.rig import Rig, await_end, segments_left
+from protocol.conformance.rig import PeerProcess, Rig, await_end, segments_left
 from protocol.conformance.rule import Level, demand, expect, server_rule
 from protocol.conformance.sound import done, parameter_names, resets
-from protocol.layout import HEADER, POSE, POSE_MAGIC, Farewell
+from protocol.layout import HEADER, POSE, POSE_MAGIC, Farewell, Field
 from protocol.liveness import start_time
 from protocol.plant import PARAMETERS
 from protocol.states import Event, State
@@ -22,6 +23,7 @@ from protocol.states import Event, State
 _NO_MAGIC: Final = bytes(8)
 _MOMENT_S: Final = 0.05
 """Long enough for a header or a reply that is not whole to be completed."""
+_LOOK_S: Final = 0.001
 _ATTACH: Final = ((State.OFFERED, Event.ATTACH),)
 _REFUSED_OFFER: Final = ((State.OFFERED, Event.FAREWELL),)
 
@@ -42,21 +44,26 @@ def header_whole_at_magic(rig: Rig) -> None:
     later = bytes(agent.pose[: POSE["farewell"].offset])
     for field in layout.POSE_SEGMENT:
         if field.offset < POSE["farewell"].offset:
-            expect(f"{field.name} when the magic showed", seen[field.bytes], later[field.bytes])
+            expect(f"bytes of {field.name} when the magic showed", seen[field.bytes], later[field.bytes])
 
 
 @server_rule("header-echoes", Level.CORE, "4", "the header echoes session, lanes, times, slots and strides")
 def header_echoes(rig: Rig) -> None:
     """Every echoed word has the bits of the agent's."""
     agent = _odd(rig)
-    for field in HEADER:
-        if field.name in handshake_echoes():
-            expect(field.name, bytes(agent.pose[field.bytes]), bytes(agent.command[field.bytes]))
+    echoed = [field for field in HEADER if field.name == "session" or field.offset >= POSE["lanes"].offset]
+    for field in echoed:
+        found, sent = bytes(agent.pose[field.bytes]), bytes(agent.command[field.bytes])
+        demand(found == sent, field.name, _in_words(sent, field), _in_words(found, field))
 
 
-def handshake_echoes() -> tuple[str, ...]:
-    """Names of the words that a physics side echoes."""
-    return ("session", *(field.name for field in HEADER if field.offset >= POSE["lanes"].offset))
+def _in_words(raw: bytes, field: Field) -> str:
+    """Write a header's word as what it is."""
+    return (
+        raw.hex()
+        if field.kind == "bytes"
+        else str(struct.unpack("<q" if field.kind == "i64" else "<d", raw)[0])
+    )
 
 
 @server_rule("header-version", Level.CORE, "13", "the header carries version 1 and a minor version")
@@ -137,8 +144,8 @@ def header_unnamed_bytes(rig: Rig) -> None:
     done(agent.reset(resets(agent)), "a reset")
     named = sorted((field.offset, field.offset + field.size) for field in layout.POSE_SEGMENT)
     for (_, end), (start, _) in itertools.pairwise(named):
-        gap = bytes(agent.pose[end:start])
-        expect(f"bytes {end} to {start} of the pose segment", gap, bytes(len(gap)))
+        written = [end + at for at, byte in enumerate(bytes(agent.pose[end:start])) if byte]
+        expect(f"bytes of the pose segment from {end} to {start} that are not zero", written, [])
 
 
 @server_rule("pose-locked", Level.CORE, "2", "the server holds the lock on its segment")
@@ -178,6 +185,16 @@ def waits_for_agent(rig: Rig) -> None:
 # --- headers that are not accepted ---
 
 
+def _verdict(agent: RawAgent, process: PeerProcess) -> tuple[int, str]:
+    """Wait until the server has said farewell, has ended, or has published a header all the same."""
+    patience = time.monotonic() + agent.timeout
+    while time.monotonic() < patience:
+        if any(handshake.magic(agent.pose)) or agent.farewell()[0] or process.watch() is not None:
+            break
+        time.sleep(_LOOK_S)
+    return agent.farewell()
+
+
 def _turned_down(rig: Rig, names: tuple[str, ...], **words: Value) -> None:
     """Offer a header with wrong words: farewell 4 that names one of the fields, no magic, and the end."""
     rendezvous = rig.rendezvous if not segments_left(rig.rendezvous) else rig.new_rendezvous()
@@ -185,7 +202,7 @@ def _turned_down(rig: Rig, names: tuple[str, ...], **words: Value) -> None:
     agent.offer(**words)
     process = rig.start(rendezvous)
     agent.attend(process)
-    reason, text = agent.await_farewell()
+    reason, text = _verdict(agent, process)
     said = f"a header with {', '.join(f'{name} = {value!r}' for name, value in words.items())}"
     expect(f"farewell to {said}", reason, int(Farewell.HANDSHAKE))
     plain = text.lower().replace("_", " ")

@@ -373,6 +373,10 @@ def not_finite_state(rig: Rig) -> None:
     batch = _placed(agent, body(velocity=(1.0, 0.0, 0.0)), force_gain=1e200)
     done_or_skip(agent.reset(batch), "a gain of 1e200")
     agent.put_commands(commands(agent, speed=speed_max(agent)))
-    agent.request(Op.STEP)
-    reason, text = agent.await_farewell()
+    try:
+        agent.ask(Op.STEP)
+    except Failure:  # it left
+        reason, text = agent.await_farewell()
+    else:
+        raise Failure("a step to a state that is not finite", "farewell 2", agent.poses().raw[0].tolist())
     demand(reason == Farewell.FAILED and bool(text), "farewell", "2 and a text", f"{reason}, {text!r}")

@@ -22,8 +22,8 @@ from protocol.layout import Op
 
 SLEEPLESS: Final = 20.0
 """How many times the round trip of loopback UDP a step of one inner step may take."""
-IDLE_SHARE: Final = 0.15
-"""Share of a core that an idle server may burn."""
+IDLE_SHARE: Final = 0.1
+"""Share of a core that an idle server may burn; one that spins burns all that others leave it."""
 PAUSE_S: Final = 1.0
 _SAMPLES: Final = 2000
 _ROUNDS: Final = 4
@@ -140,10 +140,8 @@ def latency(rig: Rig) -> str:
 def no_sleep_in_step(rig: Rig) -> str:
     """One lane, one inner step, in the same run."""
     with _udp_echo() as echo:
-        ours, udp = (
-            statistics.median(times) for times in _in_turn([_stepping(_opened(rig)), echo], _SAMPLES // 4)
-        )
-    demand(ours < SLEEPLESS * udp, "p50 of a step", f"below {SLEEPLESS * udp:.0f} us", f"{ours:.0f} us")
+        ours, udp = map(_at_best, _in_turn([_stepping(_opened(rig)), echo], _SAMPLES // 4))
+    demand(ours < SLEEPLESS * udp, "a step at best", f"below {SLEEPLESS * udp:.0f} us", f"{ours:.0f} us")
     return f"{ours / udp:.2f} times UDP"
 
 

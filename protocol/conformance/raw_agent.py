@@ -18,12 +18,14 @@ from protocol.liveness import start_time
 from protocol.memory import FENCE, Segments, parse_rendezvous
 from protocol.opening import create_segments
 from protocol.plant import COMMAND_WORDS, POSE_WORDS, RESET_WORDS, CommandBatch, PoseBatch, ResetBatch
-from protocol.waiting import Peer, Waiter, give_way
+from protocol.waiting import Peer, Waiter
 
 if TYPE_CHECKING:
     from protocol.conformance.rig import PeerProcess
 
 LOOK_S: Final = 0.01
+POLL_S: Final = 0.0005
+"""How often a header is looked for; a server that is starting needs the core more."""
 _NO_MAGIC: Final = bytes(8)
 _HEADER: Final = slice(8, 1024)
 _REQUEST_AT: Final = COMMAND["begin"].offset
@@ -129,7 +131,7 @@ class RawAgent:
                 self._demand_life("a header")
             if now - began > patience:
                 raise Failure("the server", f"a header within {patience:g} s", "none, though it runs")
-            give_way() if now - began < 0.5 else time.sleep(0.0005)
+            time.sleep(POLL_S)
         if FENCE is not None:
             FENCE()
         if handshake.magic(self.pose) != POSE_MAGIC:

@@ -128,12 +128,13 @@ def same_bits(
     Raises:
         Failure: a word differs; names the first.
     """
-    one, other = found.raw.view(np.int64)[lanes], expected.raw.view(np.int64)[lanes]
-    differing = np.argwhere(one != other)
+    differing = np.argwhere(found.raw.view(np.int64)[lanes] != expected.raw.view(np.int64)[lanes])
     if differing.size:
         row, word = differing[0].tolist()
-        values = found.raw[lanes][row].tolist(), expected.raw[lanes][row].tolist()
-        raise Failure(f"{what}, word {word} of the row", values[1], values[0])
+        lane = int(np.arange(len(found.raw))[lanes][row])
+        field = next(field for field in reversed(layout.POSE_ROW) if field.offset <= word * layout.WORD)
+        values = (getattr(batch, field.name)[lane].tolist() for batch in (expected, found))
+        raise Failure(f"{what}, {field.name} of lane {lane}", *values)
 
 
 def close_to(what: str, found: Vector | Floats, expected: Vector | Floats, tolerance: float) -> None:
