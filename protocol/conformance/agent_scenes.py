@@ -44,41 +44,62 @@ def asked(rig: Rig, op: Op) -> Iterator[tuple[RawPhysics, Request]]:
 
 
 def has_left(physics: RawPhysics) -> bool:
-    """Whether the agent has ended the session: by a farewell, by taking its names away, by its end."""
-    gone = not segments_left(physics.rendezvous) or physics.process.watch() is not None
-    return gone or physics.farewell()[0] != 0
+    """Whether the agent has ended the session by a farewell or by its end."""
+    return physics.farewell()[0] != 0 or physics.process.watch() is not None
 
 
-def ends(
-    physics: RawPhysics, since: float, what: str, *, bound: float = BOUND_S, failed: bool = True
-) -> float:
+def ends(physics: RawPhysics, since: float, what: str, *, failed: bool = True) -> float:
     """Demand that the agent ends the session in time and leaves nothing; return how long it took to leave (s).
 
     Args:
         physics: the session.
         since: when it could notice first (monotonic).
         what: what happened, for messages.
-        bound: longest time to its farewell, the removal of its names or its end (s).
         failed: whether its exit status must be another than 0.
     """
-    while not has_left(physics):
-        if time.monotonic() - since > bound:
+    stood = bool(
+        segments_left(physics.rendezvous)
+    )  # they are gone before a goodbye, which shows nothing then
+    while not has_left(physics) and not (stood and not segments_left(physics.rendezvous)):
+        if time.monotonic() - since > BOUND_S:
             raise Failure(
-                f"the agent after {what}", f"to end the session within {bound * 1e3:.0f} ms", "it has not"
+                f"the agent after {what}", f"to end the session within {BOUND_S * 1e3:.0f} ms", "it has not"
             )
         time.sleep(POLL_S)
     took = time.monotonic() - since
-    code = await_end(physics.process, f"after {what}")
-    left = segments_left(physics.rendezvous)
-    demand(not left, f"segments after {what}", "both removed by the agent", left)
-    demand(code != 0 or not failed, f"exit status after {what}", "another than 0", code)
+    _leaves_nothing(physics, what, failed)
     return took
 
 
-def turns_down(physics: RawPhysics, what: str, kind: Farewell, *, failed: bool = True) -> str:
-    """Demand that the agent ends the session with a farewell of one kind, and return its text."""
-    ends(physics, time.monotonic(), what, bound=LEAVING_S, failed=failed)
+def turns_down(physics: RawPhysics, what: str, kind: Farewell, *, last: int, failed: bool = True) -> str:
+    """Demand that the agent ends the session with a farewell of one kind, and return its text.
+
+    Args:
+        physics: the session.
+        what: what was wrong, for messages.
+        kind: the farewell that it calls for.
+        last: number of the last request that the agent could make before it saw that.
+        failed: whether its exit status must be another than 0.
+    """
+    until = time.monotonic() + LEAVING_S
+    while not has_left(physics):
+        demand(
+            physics.rung() <= last,
+            f"the agent after {what}",
+            "to end the session",
+            "it made its next request",
+        )
+        demand(time.monotonic() < until, f"the agent after {what}", "to end the session", "it has not")
+        time.sleep(POLL_S)
+    _leaves_nothing(physics, what, failed)
     found, text = physics.farewell()
     right = found == kind and bool(text)
     demand(right, f"farewell after {what}", f"kind {kind.value} with a text", f"kind {found}, {text!r}")
     return text
+
+
+def _leaves_nothing(physics: RawPhysics, what: str, failed: bool) -> None:
+    code = await_end(physics.process, f"after {what}")
+    left = segments_left(physics.rendezvous)
+    demand(not left, f"segments after {what}", "both removed by the agent", left)
+    demand(code != 0 or not failed, f"exit status after {what}", "another than 0", code)

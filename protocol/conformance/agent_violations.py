@@ -26,7 +26,8 @@ from protocol.memory import COMMAND_SUFFIX, parse_rendezvous, segment_path
 from protocol.states import Event, State
 
 ROBUSTNESS: Final = Level.ROBUSTNESS
-EARLY_SESSIONS: Final = 5
+EARLY_S: Final = (0.0, 20e-6, 200e-6, 2e-3, 10e-3)
+"""How long after a reply the next one comes, before its request (s)."""
 _REFUSED_ANSWER: Final = ((State.OFFERED, Event.FAREWELL),)
 
 
@@ -38,7 +39,7 @@ def _turned_down(rig: Rig, name: str, value: int | float | bytes) -> None:
     with meeting(rig) as physics:
         physics.attach({name: value})
         said = f"a header with {name} = {value!r}"
-        text = turns_down(physics, said, Farewell.HANDSHAKE)
+        text = turns_down(physics, said, Farewell.HANDSHAKE, last=0)
         plain = text.lower().replace("_", " ")
         demand(
             name.replace("_", " ") in plain,
@@ -138,7 +139,13 @@ def _answers_wrongly(rig: Rig, op: Op, what: str, wrong: Callable[[RawPhysics, R
         physics.reply(request.rung, words)
         physics.steps = steps
         # Who has said goodbye has nothing left to fail at.
-        turns_down(physics, f"{what} to a {op.name}", Farewell.VIOLATION, failed=op is not Op.GOODBYE)
+        turns_down(
+            physics,
+            f"{what} to a {op.name}",
+            Farewell.VIOLATION,
+            last=request.rung,
+            failed=op is not Op.GOODBYE,
+        )
 
 
 def _to_every_request(rig: Rig, what: str, wrong: Callable[[RawPhysics, Request], Wrong]) -> str:
@@ -215,19 +222,29 @@ def _reply_status(rig: Rig) -> None:
     covers=((State.READY, Event.VIOLATION),),
 )
 def _reply_early(rig: Rig) -> str:
-    """The reply to the next request is there before that request, and is otherwise as it would be."""
-    for session in range(EARLY_SESSIONS):
+    """The reply to the next request is there before that request, and is otherwise as it would be.
+
+    It comes after several delays, since nobody sees from outside when the agent has taken the last reply.
+    """
+    early = []
+    for delay in EARLY_S:
         with asked(rig, Op.STEP) as (physics, request):
-            if _answers_early(physics, request):
-                turns_down(physics, "a reply to a request that was not made", Farewell.VIOLATION)
-                return f"in session {session + 1}"
-    raise Skip("the agent asks again too quickly for a reply to come before its request")
+            if _answers_early(physics, request, delay):
+                what, last = "a reply to a request that was not made", physics.number - 1
+                turns_down(physics, what, Farewell.VIOLATION, last=last)
+                early.append(f"{delay * 1e3:g} ms")
+    if not early:
+        raise Skip("the agent asks again too quickly for a reply to come before its request")
+    return f"{', '.join(early)} after the last one"
 
 
-def _answers_early(physics: RawPhysics, request: Request | None) -> bool:
+def _answers_early(physics: RawPhysics, request: Request | None, delay: float) -> bool:
     """Answer a step and, while the agent has not begun its next request, that one too; False where it was quicker."""
     while request is not None:
         physics.answer(request)
+        answered = time.monotonic()
+        while time.monotonic() - answered < delay:
+            pass
         if _begun(physics) == request.rung:
             physics.steps += 1
             physics.reply(request.rung + 1)
@@ -276,7 +293,7 @@ def _session_at(rendezvous: str) -> bytes:
     "living-rendezvous-refused", ROBUSTNESS, "2", "a rendezvous whose agent lives is refused and left alone"
 )
 def _living_rendezvous_refused(rig: Rig) -> None:
-    """The agent ends, and not a byte of the other's session has changed; once its pid lives, once its lock is held."""
+    """The agent ends, and not a byte of the other's session has changed; its pid lives, or its lock is held."""
     for proof in ("process", "lock"):
         rendezvous = rig.new_rendezvous()
         other = rig.agent(rendezvous=rendezvous)

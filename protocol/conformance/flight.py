@@ -44,7 +44,7 @@ class Flight:
     """Size of the pose segment."""
     locked: bool
     """Whether the lock on the command segment was held."""
-    reserved: dict[str, int] = field(default_factory=dict)
+    reserved: dict[str, int]
     """Bytes of storage behind each segment."""
     requests: list[Request] = field(default_factory=list)
     out_of_turn: list[str] = field(default_factory=list)
@@ -115,17 +115,18 @@ def _fly(command: str, transport: str, timeout: float) -> Flight:
 
 
 def _record(physics: RawPhysics) -> Flight:
+    # Storage comes first: reading a page of shared memory reserves it.
+    reserved = {name: Path(name).stat().st_blocks * 512 for name in segments_left(physics.rendezvous)}
     offer = bytes(physics.command)
     flight = Flight(
-        physics.process.pid,
-        offer,
-        offer,
-        not any(physics.pose),
-        len(physics.pose),
-        _locked(physics.rendezvous),
+        pid=physics.process.pid,
+        offer=offer,
+        offer_later=offer,
+        blank_pose=not any(physics.pose),
+        pose_bytes=len(physics.pose),
+        locked=_locked(physics.rendezvous),
+        reserved=reserved,
     )
-    for name in segments_left(physics.rendezvous):
-        flight.reserved[name] = Path(name).stat().st_blocks * 512
     until = time.monotonic() + LONGEST_S
     physics.attach()
     try:

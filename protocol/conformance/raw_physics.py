@@ -153,7 +153,9 @@ class RawPhysics:
     # --- handshake ---
 
     def begin_header(self) -> None:
-        """Take the lock, by a stand-in, and write whose header this will be."""
+        """Take the lock, by a new stand-in, and write whose header this will be."""
+        if self.stand_in is not None:
+            self.stand_in.close()
         self.stand_in = StandIn(self._pose.path)
         write_i64(self.pose, POSE["pid"], self.stand_in.pid)
         write_i64(self.pose, POSE["start_time"], self.stand_in.started)

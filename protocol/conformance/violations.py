@@ -36,7 +36,7 @@ def _ends(s: Scene, what: str) -> None:
     """Let the server find what the agent has done, and demand that it ends the session as specified."""
     before = without_farewell(s.agent.pose)
     s.go_on()
-    kind, text = s.agent.await_farewell(s.agent.timeout if s.state is State.OFFERED else LEAVING_S)
+    kind, text = _await_farewell(s, f"{what} {s.where}")
     demand(kind == Farewell.VIOLATION, f"farewell after {what} {s.where}", "kind 3", f"{kind} {text!r}")
     demand(bool(text), f"text of the farewell after {what} {s.where}", "what was seen", "an empty text")
     await_end(s.server, f"after {what} {s.where}")
@@ -51,6 +51,19 @@ def _ends(s: Scene, what: str) -> None:
     expect(
         f"segments after {what} {s.where}, which the agent removes", len(segments_left(s.agent.rendezvous)), 2
     )
+
+
+def _await_farewell(s: Scene, after: str) -> tuple[int, str]:
+    """Wait for the server's farewell or its end; its answer is a failure at once."""
+    answered = s.agent.get("doorbell")
+    until = time.monotonic() + (s.agent.timeout if s.state is State.OFFERED else LEAVING_S)
+    while not s.agent.farewell()[0] and s.server.watch() is None:
+        demand(s.agent.get("doorbell") == answered, f"the server after {after}", "a farewell 3", "a reply")
+        demand(
+            time.monotonic() < until, f"the server after {after}", "a farewell 3", "none, and it still runs"
+        )
+        time.sleep(0.001)
+    return s.agent.farewell()
 
 
 def _asks(rig: Rig, what: str, op: int, **words: int) -> None:
