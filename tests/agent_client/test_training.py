@@ -111,13 +111,13 @@ def test_a_training_writes_a_checkpoint_with_its_contract(tmp_path: Path) -> Non
 def test_a_training_leaves_nothing_in_the_temporary_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without TensorBoard no folder of logs is made anywhere."""
+    """Without TensorBoard no folder of logs is made anywhere; torch keeps one of its own, made once in a process."""
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     monkeypatch.delenv("SB3_LOGDIR")
     train(options(tmp_path / "a.zip", steps=64))
-    assert list(temporary.iterdir()) == []
+    assert [path for path in temporary.iterdir() if not path.name.startswith("torchinductor_")] == []
 
 
 @pytest.mark.parametrize(
