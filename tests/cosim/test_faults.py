@@ -147,14 +147,17 @@ def test_a_killed_launcher_leaves_nothing_but_its_recording(session_name: str, t
 
 @pytest.mark.parametrize("which", ["launcher", "physics"])
 def test_a_paused_process_gives_the_same_flight(fly: Callable[..., Done], tmp_path: Path, which: str) -> None:
-    """SIGSTOP of either side for a second changes nothing in commands and poses."""
+    """SIGSTOP of either side, again and again, changes nothing in commands and poses."""
     undisturbed = fly("--max-steps", "25", out="plain").report["trajectory_hash"]
     folder = tmp_path / "run"
     with flying(f"test-pause-{os.getpid()}-{which}", folder, "--max-steps", "25", "--json") as process:
         pid = process.pid if which == "launcher" else physics_pid(folder)
-        os.kill(pid, signal.SIGSTOP)
-        time.sleep(1.0)
-        os.kill(pid, signal.SIGCONT)
+        for seconds in (0.6, 0.05, 0.2, 0.1):
+            os.kill(pid, signal.SIGSTOP)
+            time.sleep(seconds)
+            assert process.poll() is None
+            os.kill(pid, signal.SIGCONT)
+            time.sleep(0.15)
         stdout, stderr = process.communicate(timeout=DEADLINE)
         assert process.returncode == 0, stderr
     assert Done(0, stdout, stderr).report["trajectory_hash"] == undisturbed
