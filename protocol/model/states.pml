@@ -1,0 +1,66 @@
+/* The table of states: one line for each transition, compared with the table of the specification by a test.
+ * A side follows the table with what happens in `what`; a move that is not in it is stopped by the assertion. */
+
+mtype = { ABSENT, OFFERED, READY, STEPPING, RESETTING, REGISTERING, RELEASING, CLOSING, CLOSED, BROKEN };
+mtype = { STEP, RESET, REGISTER_TUBE, RELEASE_TUBE, GOODBYE };
+mtype = { OFFER, ATTACH, DONE, REFUSED, FAREWELL, VIOLATION, LOSS };
+
+#define MOVE(from, event, to) :: (state == from && what == event) -> state = to
+#define NO_OTHER :: else -> assert(false)
+
+inline offered() { atomic { if
+    MOVE(ABSENT, OFFER, OFFERED)
+    NO_OTHER
+fi } }
+
+inline attached() { atomic { if
+    MOVE(OFFERED, ATTACH, READY)
+    NO_OTHER
+fi } }
+
+inline asked() { atomic { if
+    MOVE(READY, STEP, STEPPING)
+    MOVE(READY, RESET, RESETTING)
+    MOVE(READY, REGISTER_TUBE, REGISTERING)
+    MOVE(READY, RELEASE_TUBE, RELEASING)
+    MOVE(READY, GOODBYE, CLOSING)
+    NO_OTHER
+fi } }
+
+inline answered() { atomic { if
+    MOVE(STEPPING, DONE, READY)
+    MOVE(RESETTING, DONE, READY)
+    MOVE(REGISTERING, DONE, READY)
+    MOVE(RELEASING, DONE, READY)
+    MOVE(CLOSING, DONE, CLOSED)
+    MOVE(STEPPING, REFUSED, READY)
+    MOVE(RESETTING, REFUSED, READY)
+    MOVE(REGISTERING, REFUSED, READY)
+    MOVE(RELEASING, REFUSED, READY)
+    NO_OTHER
+fi } }
+
+inline broken() { atomic { if
+    MOVE(OFFERED, FAREWELL, BROKEN)
+    MOVE(READY, FAREWELL, BROKEN)
+    MOVE(STEPPING, FAREWELL, BROKEN)
+    MOVE(RESETTING, FAREWELL, BROKEN)
+    MOVE(REGISTERING, FAREWELL, BROKEN)
+    MOVE(RELEASING, FAREWELL, BROKEN)
+    MOVE(CLOSING, FAREWELL, BROKEN)
+    MOVE(OFFERED, VIOLATION, BROKEN)
+    MOVE(READY, VIOLATION, BROKEN)
+    MOVE(STEPPING, VIOLATION, BROKEN)
+    MOVE(RESETTING, VIOLATION, BROKEN)
+    MOVE(REGISTERING, VIOLATION, BROKEN)
+    MOVE(RELEASING, VIOLATION, BROKEN)
+    MOVE(CLOSING, VIOLATION, BROKEN)
+    MOVE(OFFERED, LOSS, BROKEN)
+    MOVE(READY, LOSS, BROKEN)
+    MOVE(STEPPING, LOSS, BROKEN)
+    MOVE(RESETTING, LOSS, BROKEN)
+    MOVE(REGISTERING, LOSS, BROKEN)
+    MOVE(RELEASING, LOSS, BROKEN)
+    MOVE(CLOSING, LOSS, BROKEN)
+    NO_OTHER
+fi } }
