@@ -15,9 +15,10 @@ from cosim.errors import CosimError, OutputError
 from cosim.named_settings import idle_settings, option_name
 from cosim.options import SHIPPED_MESH, FlightOptions
 from cosim.pilots import existing_file
+from meshes.formats import Axes
 from meshes.geometry import Geometry
 from meshes.mesh_geometry import MeshGeometry
-from meshes.tube import INDUSTRIAL, Axes, read_tube
+from meshes.tube import INDUSTRIAL, read_tube
 from protocol.plant import PARAMETER_INDEX, PARAMETERS, TubeReference
 
 TUBE_FILES: Final = ("tube.obj", "tube_centerline.obj")
@@ -175,14 +176,14 @@ def generate_conduit(options: FlightOptions, recipe: TubeRecipe, folder: Path) -
 
 
 def _describe(
-    wall: Path, reference: TubeReference, centreline: Path, centreline_sha256: str, length: float
+    wall: Path, reference: TubeReference, centreline: Path | None, centreline_sha256: str, length: float
 ) -> dict[str, Any]:
     return {
         "path": str(wall),
         "sha256": reference.sha256,
         "axes": reference.axes,
         "scale": reference.scale,
-        "centreline": str(centreline),
+        "centreline": None if centreline is None else str(centreline),  # found from the wall
         "centreline_sha256": centreline_sha256,
         "length_m": length,
     }

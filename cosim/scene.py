@@ -17,7 +17,7 @@ from cosim.runs import Run, column
 from meshes.errors import MeshError
 from meshes.sweep import sweep_wall
 from meshes.swept import SweptTube, minimal_frame
-from meshes.tube import read_wall
+from meshes.wall import read_wall
 from protocol.layout import Axes
 
 Floats = NDArray[np.float64]

@@ -12,18 +12,18 @@ shortest path, the connected components and the smoothing filter, all of scipy, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import savgol_filter
-from scipy.sparse.csgraph import connected_components, dijkstra
-from scipy.spatial import cKDTree
+from scipy.signal import savgol_filter  # type: ignore[import-untyped]
+from scipy.sparse.csgraph import connected_components, dijkstra  # type: ignore[import-untyped]
+from scipy.spatial import cKDTree  # type: ignore[import-untyped]
 
 from meshes.embree import RayScene
 from meshes.errors import CentrelineError
 from meshes.geometry import Floats
-from meshes.lumen import Balls, find_balls, leave, look_around
+from meshes.lumen import Balls, find_balls, leave
 from meshes.sections import (
     close_sideways,
     measure_rings,
@@ -32,7 +32,7 @@ from meshes.sections import (
     ring_directions,
 )
 from meshes.swept import unit_tangents
-from meshes.tube import Wall
+from meshes.wall import Wall
 
 Ints = NDArray[np.int64]
 
@@ -65,6 +65,11 @@ class FoundCentreline:
     """Whether a wall stands before its start and behind its end."""
     notes: tuple[str, ...]
     """What a user should know."""
+
+    def scaled(self, factor: float) -> FoundCentreline:
+        """The same in a wall that is `factor` times as large, about the origin."""
+        openings = tuple(Opening(o.centre * factor, o.outward, o.radius * factor) for o in self.openings)
+        return replace(self, points=self.points * factor, radius=self.radius * factor, openings=openings)
 
 
 def find_centreline(
@@ -108,7 +113,7 @@ def find_openings(scene: RayScene, balls: Balls, component: Ints) -> list[Openin
         return []
     radius = float(np.median(balls.radii[component]))
     near = cKDTree(points).sparse_distance_matrix(cKDTree(points), 0.5 * radius)
-    count, labels = connected_components(near, directed=False)
+    _count, labels = connected_components(near, directed=False)
     sizes = np.bincount(labels)
     openings = []
     for k in np.argsort(-sizes):
@@ -139,7 +144,7 @@ def _nearest(balls: Balls, component: Ints, point: Floats) -> int:
 
 def shortest_way(balls: Balls, start: int, end: int) -> Ints:
     """Balls along the way from one to another that is short and keeps clear of the wall."""
-    reached, before = dijkstra(balls.ways, directed=False, indices=start, return_predecessors=True)
+    _reached, before = dijkstra(balls.ways, directed=False, indices=start, return_predecessors=True)
     way = [end]
     while way[-1] != start:
         way.append(int(before[way[-1]]))
@@ -156,8 +161,7 @@ def centre_path(scene: RayScene, path: Floats, radii: Floats) -> Floats:
         points = resample_evenly(points, step)
         tangents = unit_tangents(points)
         rings = measure_rings(scene, points, tangents)
-        along = np.linspace(0.0, step * (len(points) - 1), len(points))
-        closed = close_sideways(rings.distances, along, radius)
+        closed = close_sideways(rings.distances, step, radius)
         points = _keep_free(scene, points, points + 0.8 * offsets_of_centres(rings, closed))
         points = _keep_free(scene, points, _smooth(points, 0.75 * radius / step))
     return points
@@ -165,8 +169,8 @@ def centre_path(scene: RayScene, path: Floats, radii: Floats) -> Floats:
 
 def _smooth(points: Floats, half: float) -> Floats:
     """A cubic through each point's neighbours, `half` of them to either side."""
-    window = min(2 * max(int(round(half)), 2) + 1, (len(points) - 1) // 2 * 2 + 1)
-    return savgol_filter(points, window, 3, axis=0) if window > 3 else points  # type: ignore[no-any-return]
+    window = min(2 * max(round(half), 2) + 1, (len(points) - 1) // 2 * 2 + 1)
+    return savgol_filter(points, window, 3, axis=0) if window > 3 else points
 
 
 def _keep_free(scene: RayScene, points: Floats, moved: Floats) -> Floats:
@@ -207,6 +211,3 @@ def extend(scene: RayScene, points: Floats) -> tuple[Floats, bool]:
             typical = distances
         added.append(there)
     return np.concatenate([points[:-1], added]), False
-
-
-_ = look_around

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
+from scipy.sparse import csr_array  # type: ignore[import-untyped]
+from scipy.spatial import cKDTree  # type: ignore[import-untyped]
 
 from meshes.embree import RayScene
 from meshes.geometry import Floats
@@ -162,7 +162,7 @@ def leave(scene: RayScene, centres: Floats, radii: Floats) -> tuple[Floats, Floa
     """
     looks = look_around(scene, centres, LEAVING)
     ball, look = np.nonzero(looks >= REACH * radii[:, None])
-    chosen = np.unique(np.linspace(0, len(ball) - 1, MOST_LEAVING).astype(int)) if len(ball) else []
+    chosen = np.unique(np.linspace(0, len(ball) - 1, min(MOST_LEAVING, len(ball))).astype(np.int64))
     ball, look = ball[chosen], look[chosen]
     way, reach = sphere(LEAVING)[look], radii[ball]
     left_after = np.full(len(ball), np.inf)

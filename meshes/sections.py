@@ -8,8 +8,8 @@ import numpy as np
 
 from meshes.curves import arc_lengths
 from meshes.embree import RayScene
-from meshes.geometry import Bools, Floats
-from meshes.swept import minimal_frame, unit_tangents
+from meshes.geometry import Floats
+from meshes.swept import minimal_frame
 
 RING = 48
 """Rays of a ring."""
@@ -58,14 +58,13 @@ def measure_rings(scene: RayScene, points: Floats, tangents: Floats) -> Rings:
     return Rings(normals, binormals, distances.reshape(-1, RING))
 
 
-def close_sideways(distances: Floats, along: Floats, radius: float) -> Floats:
+def close_sideways(distances: Floats, step: float, radius: float) -> Floats:
     """Distances (M, RING) with side branches and holes closed, all finite.
 
     A ray that is much longer than rays of the same angle nearby, or endless, takes the length at which it would
-    no longer stand out: their median, over `WINDOW` radii of arc length `along` (M,) ahead and behind.
+    no longer stand out: their median over `WINDOW` radii (m) ahead and behind; rings stand `step` (m) apart.
     """
-    step = float(along[-1]) / max(len(along) - 1, 1)
-    reach = max(int(round(WINDOW * radius / max(step, 1e-12))), 1)
+    reach = max(round(WINDOW * radius / max(step, 1e-12)), 1)
     padded = np.pad(distances, ((reach, reach), (0, 0)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=0)
     # Every fourth row of the window is enough for a median.
@@ -94,12 +93,9 @@ def resample_evenly(points: Floats, step: float) -> Floats:
     return np.stack([np.interp(wanted, along, points[:, k]) for k in range(3)], axis=1)
 
 
-def tangents_of(points: Floats) -> Floats:
-    """Unit tangents (M, 3) of an evenly sampled curve."""
-    return unit_tangents(points)
-
-
-def whole(rings: Rings) -> Bools:
-    """Whether every ray of a ring meets a wall, (M,)."""
-    complete: Bools = np.isfinite(rings.distances).all(axis=1)
-    return complete
+def mean_radius(scene: RayScene, axis: Floats, tangents: Floats) -> float:
+    """Mean wall distance (m) over the sections of an evenly sampled axis (M, 3), side branches closed."""
+    rings = measure_rings(scene, axis, tangents)
+    met = rings.distances[np.isfinite(rings.distances)]
+    step = float(np.linalg.norm(axis[1] - axis[0]))
+    return float(close_sideways(rings.distances, step, float(np.median(met))).mean())

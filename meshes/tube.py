@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import hashlib
-import io
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
 from meshes.centreline import parse_centreline, resample
-from meshes.embree import RayScene
-from meshes.errors import CentrelineError, MeshReadError
+from meshes.errors import CentrelineError
+from meshes.formats import Axes, AxesChoice
 from meshes.geometry import Floats
-from meshes.obj import first_of_each, parse_obj, read_bytes, weld
+from meshes.obj import read_bytes
+from meshes.wall import Wall, read_wall, to_world
 
-Axes = Literal["zup", "yup"]
-"""Which way a file points: "zup" as the world; "yup" as Blender's export writes by default, (x, z, -y)."""
-
-FORMATS = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
-"""Suffixes of the mesh formats that are read: those that trimesh reads without further packages, and .obj."""
+if TYPE_CHECKING:
+    from meshes.centreline_finding import FoundCentreline  # at run time only where one is looked for
 
 INDUSTRIAL = Path(__file__).parent / "industrial" / "industrial.obj"
 """The shipped conduit."""
@@ -33,33 +29,11 @@ LEAST_STEPS = 200
 """Steps that a short tube has at least."""
 LENGTHS = (1e-3, 1e5)
 """Shortest and longest centreline (m): what lies outside is a wrong unit, not a tube."""
-FARTHEST = 1e9
-"""Largest coordinate (m): room for any survey's origin, and far from where single precision overflows."""
 RING = 36
 """Rays over which the local radius is the mean."""
 LEAST_HITS = RING // 2 + 1
 """Rays of a ring that must meet a wall: from outside of a convex wall fewer than half of them can. The rest may
 leave through a side opening, or near an end through a mouth that is not square to the centreline."""
-
-
-@dataclass(frozen=True)
-class Wall:
-    """The wall of a tube in the world frame (m): open or closed, single or double, in any winding."""
-
-    vertices: Floats  # (V, 3)
-    faces: NDArray[np.int32]  # (F, 3)
-    path: Path
-    sha256: str
-    """Of the bytes of the file, in hexadecimal."""
-    axes: Axes
-    scale: float
-    duplicate_faces: int
-    """How many faces were dropped, since others have the same corners."""
-
-    @cached_property
-    def scene(self) -> RayScene:
-        """The wall ready for rays; built once, when first asked for."""
-        return RayScene(self.vertices, self.faces)
 
 
 @dataclass(frozen=True)
@@ -79,8 +53,12 @@ class Tube:
     """Arc length between neighbouring points (m)."""
     length: float
     """Length of the centreline (m)."""
-    centreline_path: Path
+    centreline_path: Path | None
+    """None where the centreline was found from the wall."""
     centreline_sha256: str
+    """Of the bytes of the centreline's file; of a found one, of its points in the file's coordinates."""
+    found: FoundCentreline | None = None
+    """How the centreline was found, where it was."""
 
     @property
     def path(self) -> Path:
@@ -103,68 +81,90 @@ class Tube:
         return self.wall.scale
 
 
-def read_wall(path: str | Path, axes: Axes = "zup", scale: float = 1.0) -> Wall:
-    """Read a mesh as the wall of a tube: .obj by this package, the other `FORMATS` by trimesh.
+@dataclass(frozen=True)
+class MeanRadius:
+    """A scale that makes a tube so wide: the mean, along the axis, of the wall's mean distance in each section."""
 
-    Args:
-        path: the file.
-        axes: "zup" keeps the file's axes; "yup" maps (x, y, z) to (x, -z, y).
-        scale: metres in one unit of the file.
-
-    Raises:
-        MeshReadError: no such file, not a readable mesh, one without faces, or a scale that no tube has.
-    """
-    path = Path(path)
-    content = read_bytes(path)
-    if path.suffix.lower() == ".obj":
-        data = parse_obj(content, path)
-        vertices, corners, duplicates = data.vertices, data.faces.astype(np.int64), data.duplicate_faces
-    else:
-        vertices, corners, duplicates = _parse_by_trimesh(content, path)
-    if not len(corners):
-        raise MeshReadError(f"{path}: expected a mesh with faces, found {len(vertices)} vertices and no face")
-    used, faces = np.unique(corners, return_inverse=True)
-    return Wall(
-        vertices=_to_world(vertices[used], axes, scale, path),
-        faces=faces.reshape(-1, 3).astype(np.int32),
-        path=path,
-        sha256=hashlib.sha256(content).hexdigest(),
-        axes=axes,
-        scale=scale,
-        duplicate_faces=duplicates,
-    )
+    metres: float
 
 
 def read_tube(
     mesh: str | Path,
     centreline: str | Path | None = None,
-    axes: Axes = "zup",
-    scale: float = 1.0,
+    axes: AxesChoice = "auto",
+    scale: float | MeanRadius | None = None,
     start_end: Literal["first", "last"] = "first",
+    entry: ArrayLike | None = None,
+    exit: ArrayLike | None = None,
 ) -> Tube:
-    """Read a wall and its centreline, and check that the one runs inside the other.
+    """Read a wall, read or find its centreline, and check that the one runs inside the other.
 
     Args:
         mesh: the file of the wall.
-        centreline: the .obj of the centreline; None for `<mesh stem>_centerline.obj` beside the mesh.
+        centreline: the .obj of the centreline; None for `<mesh stem>_centerline.obj` beside the mesh. Where that
+            is absent, or `entry` or `exit` is given, the centreline is found from the wall.
         axes: of both files, see `read_wall`.
-        scale: metres in one unit of both files.
+        scale: metres in one unit of both files, see `read_wall`.
         start_end: the end of the centreline where the drone starts; "first" is the one whose vertex stands
-            first in the file.
+            first in the file, or the found one's first.
+        entry: (3,) where to start, in the coordinates of the file, see `find_centreline`.
+        exit: (3,) where to end.
 
     Raises:
         MeshReadError: either file cannot be read.
-        CentrelineError: the centreline is missing, is no single open path, has a length out of `LENGTHS`, or
-            leaves the tube.
+        CentrelineError: the centreline cannot be found, is no single open path, has a length out of `LENGTHS`,
+            or leaves the tube.
     """
+    if isinstance(scale, MeanRadius):
+        unscaled = read_tube(mesh, centreline, axes, None, start_end, entry, exit)
+        return _rescale(unscaled, scale, centreline, start_end)
     wall = read_wall(mesh, axes, scale)
-    path = _find_centreline(wall.path, centreline)
+    path = None if entry is not None or exit is not None else _find_centreline_file(wall.path, centreline)
+    if path is None:
+        return _tube_of_found(wall, _find(wall, entry, exit), start_end)
     content = read_bytes(path)
-    points = _to_world(parse_centreline(content, path), axes, scale, path)
+    points = to_world(parse_centreline(content, path), wall.axes, wall.scale, path)
+    return _tube(wall, points, path, hashlib.sha256(content).hexdigest(), start_end)
+
+
+def _find(wall: Wall, entry: ArrayLike | None, exit: ArrayLike | None) -> FoundCentreline:
+    from meshes.centreline_finding import (
+        find_centreline,
+    )  # here, since scipy takes a while that others do not need
+
+    ends = (
+        None if end is None else wall.to_world(np.reshape(end, (1, 3)).astype(float))[0]
+        for end in (entry, exit)
+    )
+    return find_centreline(wall, *ends)
+
+
+def _tube_of_found(wall: Wall, found: FoundCentreline, start_end: Literal["first", "last"]) -> Tube:
+    sha256 = hashlib.sha256(np.ascontiguousarray(wall.to_file(found.points)).tobytes()).hexdigest()
+    return replace(_tube(wall, found.points, None, sha256, start_end), found=found)
+
+
+def _rescale(
+    tube: Tube, scale: MeanRadius, centreline: str | Path | None, start_end: Literal["first", "last"]
+) -> Tube:
+    """The tube at the scale at which its mean radius is as wanted."""
+    from meshes.sections import mean_radius
+
+    if not (np.isfinite(scale.metres) and scale.metres > 0.0):
+        raise CentrelineError(f"scale: expected a mean radius above 0 m, found {scale.metres}")
+    factor = scale.metres / mean_radius(tube.wall.scene, tube.axis, tube.tangent)
+    metres = tube.scale * factor
+    if tube.found is None:
+        return read_tube(tube.path, centreline, tube.axes, metres, start_end)
+    return _tube_of_found(read_wall(tube.path, tube.axes, metres), tube.found.scaled(factor), start_end)
+
+
+def _tube(
+    wall: Wall, points: Floats, path: Path | None, sha256: str, start_end: Literal["first", "last"]
+) -> Tube:
     if start_end == "last":
         points = points[::-1]
-
-    length = _length(points, scale, path)
+    length = _length(points, wall.scale, path or wall.path)
     axis, tangent = resample(points, min(LONGEST_STEP, length / LEAST_STEPS))
     tube = Tube(
         wall=wall,
@@ -175,25 +175,20 @@ def read_tube(
         step=length / (len(axis) - 1),
         length=length,
         centreline_path=path,
-        centreline_sha256=hashlib.sha256(content).hexdigest(),
+        centreline_sha256=sha256,
     )
     return replace(tube, radius=_local_radius(tube))
 
 
-def _find_centreline(mesh: Path, named: str | Path | None) -> Path:
+def _find_centreline_file(mesh: Path, named: str | Path | None) -> Path | None:
+    """The file of the centreline; None where none is named and none lies beside the mesh."""
     if named is not None:
         path = Path(named)
         if _is_missing(path):
             raise CentrelineError(f"{path}: expected the centreline of {mesh} here, found no such file")
         return path
     path = mesh.with_name(f"{mesh.stem}_centerline.obj")
-    if _is_missing(path):
-        raise CentrelineError(
-            f"{mesh}: expected its centreline beside it as {path.name}, found no such file; it cannot be "
-            f"found from the mesh yet: export the guide curve as an .obj of edges, under that name or "
-            f"named with --centerline"
-        )
-    return path
+    return None if _is_missing(path) else path
 
 
 def _is_missing(path: Path) -> bool:
@@ -207,25 +202,6 @@ def _is_missing(path: Path) -> bool:
     return False
 
 
-def _to_world(points: Floats, axes: Axes, scale: float, path: Path) -> Floats:
-    if not (np.isfinite(scale) and scale > 0):
-        raise MeshReadError(f"scale: expected a positive number of metres a unit, found {scale}")
-    if axes not in ("zup", "yup"):
-        raise MeshReadError(f"axes: expected 'zup' or 'yup', found {axes!r}")
-    with np.errstate(over="ignore", under="ignore"):
-        points = points * scale
-    farthest = np.abs(points).max(initial=0.0)
-    if not farthest <= FARTHEST:
-        raise MeshReadError(
-            f"{path}: scale: expected one that keeps all coordinates within {FARTHEST:g} m, found {scale:g} "
-            f"metres a unit, which puts one at {farthest:g} m; check the unit of the file"
-        )
-    if axes == "zup":
-        return points
-    x, y, z = points.T
-    return np.stack([x, -z, y], axis=1)
-
-
 def _length(points: Floats, scale: float, path: Path) -> float:
     """Length (m) of a polyline (P, 3) that is plausible for a tube; CentrelineError for any other."""
     with np.errstate(under="ignore"):
@@ -237,31 +213,6 @@ def _length(points: Floats, scale: float, path: Path) -> float:
             f"{scale:g} metres a unit, which makes it {length:.4g} m; check the unit of the file"
         )
     return length
-
-
-def _parse_by_trimesh(content: bytes, path: Path) -> tuple[Floats, NDArray[np.int64], int]:
-    suffix = path.suffix.lower()
-    if suffix not in FORMATS:
-        raise MeshReadError(
-            f"{path}: expected a mesh format that can be read ({', '.join(FORMATS)}), found {path.suffix!r}"
-        )
-    import trimesh  # here, since it takes half a second that an .obj does not need
-
-    try:
-        mesh = trimesh.load_scene(io.BytesIO(content), file_type=suffix[1:]).to_mesh()
-        vertices = np.array(mesh.vertices, dtype=np.float64).reshape(-1, 3)
-        faces = np.array(mesh.faces, dtype=np.int64).reshape(-1, 3)
-    except ImportError as error:  # asked for by rare contents only, damaged ones among them
-        raise MeshReadError(
-            f"{path}: not a readable mesh of format {suffix}; if the file is whole, reading it needs the package "
-            f"{error.name}, which is not installed"
-        ) from error
-    except Exception as error:  # every loader of trimesh fails in its own way
-        raise MeshReadError(f"{path}: not a readable mesh of format {suffix} ({error})") from error
-    if not np.isfinite(vertices).all():
-        raise MeshReadError(f"{path}: expected finite coordinates, found NaN or infinity")
-    kept = first_of_each(weld(vertices)[faces]) if len(faces) else np.empty(0, np.int64)
-    return vertices, faces[kept], len(faces) - len(kept)
 
 
 def _local_radius(tube: Tube) -> Floats:
@@ -293,7 +244,7 @@ def _local_radius(tube: Tube) -> Floats:
         if crossed[i]:
             found += " and the wall crossed by it"
         raise CentrelineError(
-            f"{tube.centreline_path}: expected a centreline inside of the tube {tube.path.name}, found at "
+            f"{tube.centreline_path or 'found'}: expected a centreline inside of the tube {tube.path.name}, found at "
             f"arc length {tube.arc_length[i]:.2f} m of {tube.length:.2f} m {found}; "
             f"{wrong.sum()} of {len(wrong)} points are wrong: check that both files have the same axes and unit"
         )

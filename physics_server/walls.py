@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from meshes.errors import MeshError
 from meshes.geometry import Floats
-from meshes.tube import Wall, read_wall
+from meshes.wall import Wall, read_wall
 from protocol.errors import Refusal
 from protocol.plant import TubeReference
 

@@ -15,7 +15,7 @@ from cosim.errors import CosimError
 from cosim.walls import WallRegistry, wall_slots, write_wall
 from meshes.swept import SweptTube
 from meshes.swept_geometry import SweptGeometry
-from meshes.tube import read_wall
+from meshes.wall import read_wall
 from protocol.agent import AgentSession, SessionSettings
 from protocol.plant import ResetBatch, TubeReference
 from protocol.twin import open_twin

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 from meshes.centreline import parse_centreline, resample
 from meshes.errors import CentrelineError, MeshReadError
-from meshes.tube import read_tube, read_wall
+from meshes.tube import read_tube
+from meshes.wall import read_wall
 
 WriteTube = Callable[..., Path]
 ELSEWHERE = Path(__file__).parents[3] / "shared" / "meshes"
@@ -91,7 +92,7 @@ def test_other_formats_read_as_the_same_wall(suffix: str, tmp_path: Path, shapes
         (
             "notes.txt",
             b"no mesh at all",
-            r"that can be read \(\.glb, \.gltf, \.obj, \.off, \.ply, \.stl\), found '\.txt'",
+            r"that can be read \(\.dae, \.glb, \.gltf, \.obj, \.off, \.ply, \.stl\), found '\.txt'",
         ),
     ],
 )
@@ -123,7 +124,7 @@ def test_missing_file_and_meaningless_options_are_refused(tmp_path: Path) -> Non
         read_wall(tmp_path / "absent.stl")
     path = tmp_path / "one.obj"
     path.write_text("v 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n")
-    with pytest.raises(MeshReadError, match="axes: expected 'zup' or 'yup', found 'xup'"):
+    with pytest.raises(MeshReadError, match="axes: expected 'auto', 'zup' or 'yup', found 'xup'"):
         read_wall(path, "xup")  # type: ignore[arg-type]
     for scale in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(MeshReadError, match="scale: expected a positive number"):
@@ -364,14 +365,24 @@ def test_centreline_outside_of_the_tube_is_refused(
         read_tube(write_tube(shapes.straight(rings=101)), line)
 
 
-def test_missing_centrelines_are_refused(write_tube: WriteTube, shapes: Any, tmp_path: Path) -> None:
-    """One that is named must exist; where none is named, one must lie beside the mesh."""
+def test_named_centrelines_must_exist(write_tube: WriteTube, shapes: Any, tmp_path: Path) -> None:
+    """One that is named and absent is an error, and none is looked for in its place."""
     path = write_tube(shapes.straight())
     with pytest.raises(CentrelineError, match=r"absent\.obj: expected the centreline of .*tube\.obj here"):
         read_tube(path, tmp_path / "absent.obj")
+
+
+def test_centreline_is_found_where_none_is_given(write_tube: WriteTube, shapes: Any) -> None:
+    """Without a file beside the mesh it is found from the wall; the tube says so, with the hash of its points."""
+    path = write_tube(shapes.bend())
+    given = read_tube(path)
     path.with_name("tube_centerline.obj").unlink()
-    with pytest.raises(CentrelineError, match=r"tube_centerline\.obj, found no such file; .*--centerline"):
-        read_tube(path)
+    found = read_tube(path)
+    assert (found.centreline_path, given.found) == (None, None)
+    assert found.found is not None
+    assert len(found.centreline_sha256) == 64
+    assert found.length == pytest.approx(given.length, abs=0.3)
+    assert read_tube(path).centreline_sha256 == found.centreline_sha256
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e-5, 1e5, 1e12, 1e300])
