@@ -200,7 +200,7 @@ def tube_of_each_lane(rig: Rig) -> None:
     batch = resets(agent, **{**AT_REST, "force_gain": 4.0, "body_radius": 0.1, "restitution": 0.0})
     batch.tube[0] = 0
     done(agent.reset(batch), "a reset of lane 0 into the box and of lane 1 into free space")
-    speed = min(4.0, speed_max(agent))
+    speed = min(1.0, speed_max(agent))
     poses = fly(agent, commands(agent, speed=speed), math.ceil((2.0 / speed + 0.6) / agent.settings.dt))
     touched = [max(int(pose.contact_steps[lane]) for pose in poses) for lane in (0, 1)]
     demand(touched[0] > 0 and touched[1] == 0, "contact_steps of lanes 0 and 1", "some, and none", touched)

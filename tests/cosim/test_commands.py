@@ -12,7 +12,7 @@ QUANTILES = {"p50_us", "p99_us", "p999_us"}
 PHASES = {"wait", "physics", "rays", "features", "policy", "recording", "other"}
 
 
-@pytest.mark.parametrize("command", ["launch", "train", "figures", "export", "bench"])
+@pytest.mark.parametrize("command", ["launch", "train", "figures", "export", "bench", "conformance"])
 def test_help_says_how_to_call_a_command(command: str, tmp_path: Path) -> None:
     """Every command has a page of help that fits a screen's width."""
     done = run_cosim(command, "--help", cwd=tmp_path)
