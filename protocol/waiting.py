@@ -17,7 +17,6 @@ from protocol.errors import HandshakeError, PeerLost, ProtocolError, SessionErro
 from protocol.handshake import magic, read_farewell
 from protocol.layout import Farewell
 from protocol.liveness import Life, how_ended, life
-from protocol.memory import FENCE
 
 POLLS: Final = 200
 """Polls of the doorbell before the first yield, about 8 us."""
@@ -204,5 +203,3 @@ def await_header(pose: memoryview, rendezvous: str, watch: Watch | None, timeout
                 "attach",
             )
         time.sleep(NAP_MIN_S)
-    if FENCE is not None:
-        FENCE()

@@ -18,10 +18,9 @@ def test_whatever_only_takes_time_changes_no_bit(soak: Soak) -> None:
 
 
 def test_no_step_of_a_long_run_is_lost_doubled_or_torn(soak: Soak) -> None:
-    """20,000 steps over either transport: each side checks every word of each, and both count the same."""
+    """20,000 steps over either transport, with and without machine code: each side checks every word of each."""
     runs = soak("steps", "--count", "20000")
-    assert {name: (run["steps"], run["integrated"]) for name, run in runs.items()} == {
-        "shm": (20_000, 20_000),
-        "file": (20_000, 20_000),
-    }
-    assert all(run["refused"] == 20_000 // 997 for run in runs.values())
+    assert {"shm, stdlib", "file, stdlib"} <= set(runs)
+    for name, run in runs.items():
+        assert run["exchange"].startswith(name.split(", ")[1])
+        assert (run["steps"], run["integrated"], run["refused"]) == (20_000, 20_000, 20_000 // 997)

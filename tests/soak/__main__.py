@@ -1,6 +1,6 @@
 """`python tests/soak steps|kills|pauses`: at length what every run of the suite does in seconds.
 
-steps    so many control steps over either transport, every word of which is checked on both sides
+steps    so many control steps over either transport, by every way to exchange them, all words checked on both sides
 kills    so many random kills of either side, each of which must be noticed in time and leave nothing
 pauses   so many rounds of one flight, frozen, slowed, on other cores, by other ways to wait: always the same bytes
 
@@ -16,6 +16,7 @@ import sys
 from typing import Any
 
 from kills import BOUND_S, run_kills
+from pair import exchanges
 from pauses import run_pauses
 from steps import run_steps
 
@@ -38,7 +39,8 @@ def main() -> int:
 
 
 def _steps(count: int, _seed: int) -> tuple[dict[str, Any], bool]:
-    return {transport: run_steps(count, transport) for transport in TRANSPORTS}, True
+    ways = exchanges()
+    return {f"{place}, {way}": run_steps(count, place, way) for place in TRANSPORTS for way in ways}, True
 
 
 def _kills(count: int, seed: int) -> tuple[dict[str, Any], bool]:

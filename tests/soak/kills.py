@@ -9,7 +9,7 @@ import time
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from pair import Pair, Report, Roles, meeting, queued_seconds
+from pair import SIDES, Pair, Report, Roles, exchanges, meeting, queued_seconds
 
 from protocol.agent import AgentSession, SessionSettings
 from protocol.plant import CommandBatch, PoseBatch, ResetBatch
@@ -32,6 +32,7 @@ class Kill:
     """One kill and what came of it."""
 
     transport: str
+    exchange: str
     victim: str
     moment: str
     after_s: float
@@ -74,10 +75,10 @@ def _fly(session: AgentSession, pause: float, leave_at: float) -> int:
     return session.steps
 
 
-def kill_once(chance: random.Random) -> Kill:
+def kill_once(chance: random.Random, ways: tuple[str, ...]) -> Kill:
     """Start a pair, kill one of the two at a random moment, and see how the other ends."""
-    transport, victim = chance.choice(("shm", "file")), chance.choice(("agent", "physics"))
-    moment = chance.choice(MOMENTS)
+    transport, victim = chance.choice(("shm", "file")), chance.choice(SIDES)
+    moment, exchange = chance.choice(MOMENTS), chance.choice(ways)
     survivor = "physics" if victim == "agent" else "agent"
     leave_at = time.monotonic() + (_GOODBYE_AT_S if moment == "goodbye" else 3600.0)
     idle = moment == "idle"
@@ -85,6 +86,7 @@ def kill_once(chance: random.Random) -> Kill:
         SessionSettings(1, 0.1, 0.1),
         _PausingPlant if idle and victim == "physics" else ToyPlant,
         lambda session: _fly(session, PAUSE_S if idle and victim == "agent" else 0.0, leave_at),
+        exchange=dict.fromkeys(SIDES, exchange),
     )
     after = {
         "start": chance.uniform(0.0, START_S),
@@ -112,7 +114,7 @@ def kill_once(chance: random.Random) -> Kill:
     fault = fault or _judge(end)
     step = int(end.text.split("at step ")[1].split(",")[0]) if end and "at step " in end.text else 0
     error = end.error if end else ""
-    return Kill(transport, victim, moment, after, error, noticed, queued, step, fault)
+    return Kill(transport, exchange, victim, moment, after, error, noticed, queued, step, fault)
 
 
 def _judge(end: Report | None) -> str:
@@ -126,10 +128,10 @@ def _judge(end: Report | None) -> str:
 
 def run_kills(count: int, seed: int) -> dict[str, Any]:
     """Kill until `count` deaths were there to be noticed; kills after an orderly end come on top."""
-    chance = random.Random(seed)
+    chance, ways = random.Random(seed), exchanges()
     kills: list[Kill] = []
     while sum(kill.counts or bool(kill.fault) for kill in kills) < count:
-        kills.append(kill_once(chance))
+        kills.append(kill_once(chance, ways))
     noticed = sorted(kill.noticed_s for kill in kills if kill.counts)
     net = sorted(kill.noticed_s - kill.queued_s for kill in kills if kill.counts)
     return {
@@ -143,8 +145,9 @@ def run_kills(count: int, seed: int) -> dict[str, Any]:
         "by_moment": {
             f"{moment} of {victim}": sum(k.counts and (k.moment, k.victim) == (moment, victim) for k in kills)
             for moment in MOMENTS
-            for victim in ("agent", "physics")
+            for victim in SIDES
         },
+        "by_exchange": {way: sum(k.counts and k.exchange == way for k in kills) for way in ways},
         "steps": sorted(kill.step for kill in kills if kill.counts),
         "cores": len(os.sched_getaffinity(0)),
     }

@@ -15,11 +15,13 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
 from protocol.agent import AgentSession, SessionSettings
+from protocol.compiled_choice import COMPILED, ENVIRONMENT, STDLIB
 from protocol.errors import ProtocolError
 from protocol.liveness import Life, life, start_time
 from protocol.physics import serve
@@ -35,6 +37,16 @@ def _as_it_is(side: str) -> None:
     """Prepare nothing."""
 
 
+def exchanges() -> tuple[str, ...]:
+    """The ways to exchange steps that there are here, loaded before anything is forked."""
+    if find_spec("numba") is None:
+        return (STDLIB,)
+    from protocol.compiled import load_kernels
+
+    load_kernels(True)
+    return (STDLIB, COMPILED)
+
+
 @dataclass(frozen=True)
 class Roles:
     """What the two peers do."""
@@ -44,6 +56,8 @@ class Roles:
     """Makes the plant; its `report()`, where it has one, goes into the physics side's report."""
     fly: Callable[[AgentSession], Any]
     """Flies an open session; what it returns goes into the agent's report."""
+    exchange: dict[str, str] = field(default_factory=lambda: dict.fromkeys(SIDES, STDLIB))
+    """How either side exchanges steps: by the standard library, or by machine code."""
     prepare: Callable[[str], None] = _as_it_is
     """Called in either child with its side before it begins: pins cores, sets how it waits."""
 
@@ -73,12 +87,14 @@ class Pair:
 
         def agent() -> Any:
             os.close(tell)
+            os.environ[ENVIRONMENT] = roles.exchange["agent"]
             physics = int.from_bytes(os.read(told, 8), "little")
             roles.prepare("agent")
             with AgentSession.open(rendezvous, roles.settings, watch=watch_of(physics)) as session:
                 return roles.fly(session)
 
         def physics() -> Any:
+            os.environ[ENVIRONMENT] = roles.exchange["physics"]
             roles.prepare("physics")
             plant = roles.plant()
             serve(rendezvous, plant, launcher=self.pids["agent"])

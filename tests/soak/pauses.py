@@ -16,10 +16,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from pair import SIDES, Pair, Roles, meeting
+from pair import SIDES, Pair, Roles, exchanges, meeting
 
 from protocol import waiting
 from protocol.agent import AgentSession, SessionSettings
+from protocol.compiled_choice import COMPILED, STDLIB
 from protocol.plant import CommandBatch, PoseBatch, ResetBatch
 from protocol.toy import DEFAULTS, ToyPlant
 from protocol.twin import open_twin
@@ -62,6 +63,8 @@ class Variant:
     one_core: bool = False
     wait: Callable[[], None] | None = None
     """Changes how both sides wait; None leaves the usual way."""
+    compiled: tuple[str, ...] = ()
+    """The sides that exchange steps by machine code."""
 
 
 VARIANTS: Final = {
@@ -78,6 +81,10 @@ VARIANTS: Final = {
     "yielding on one core, both frozen": Variant(freeze=SIDES, one_core=True, wait=wait_yielding),
     "sleeping": Variant(wait=wait_sleeping),
     "sleeping on one core, agent frozen": Variant(freeze=("agent",), one_core=True, wait=wait_sleeping),
+    "machine code": Variant(compiled=SIDES),
+    "machine code of the agent's, physics frozen": Variant("file", ("physics",), compiled=("agent",)),
+    "machine code of physics, one core": Variant(one_core=True, compiled=("physics",)),
+    "machine code, both frozen": Variant(freeze=SIDES, compiled=SIDES),
 }
 
 
@@ -145,7 +152,13 @@ def run_variant(variant: Variant, chance: random.Random) -> dict[str, Any]:
             variant.wait()
 
     plant = _SlowPlant if variant.slow == "physics" else ToyPlant
-    roles = Roles(SETTINGS, plant, lambda session: fly(session, variant.slow == "agent"), prepare)
+    roles = Roles(
+        SETTINGS,
+        plant,
+        lambda session: fly(session, variant.slow == "agent"),
+        {side: COMPILED if side in variant.compiled else STDLIB for side in SIDES},
+        prepare,
+    )
     freezes = 0
     with meeting(variant.transport) as rendezvous:
         pair = Pair(rendezvous, roles)
@@ -165,8 +178,9 @@ def run_variant(variant: Variant, chance: random.Random) -> dict[str, Any]:
 
 def run_pauses(seed: int) -> dict[str, Any]:
     """Fly in every way, one after another; the first is undisturbed and without a second process."""
-    chance = random.Random(seed)
+    chance, ways = random.Random(seed), exchanges()
     flights: dict[str, Any] = {"twin": {"hash": undisturbed(), "freezes": 0}}
     for name, variant in VARIANTS.items():
-        flights[name] = run_variant(variant, chance)
+        if COMPILED in ways or not variant.compiled:
+            flights[name] = run_variant(variant, chance)
     return flights

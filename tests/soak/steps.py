@@ -10,7 +10,7 @@ import time
 from typing import Any, Final
 
 import numpy as np
-from pair import Pair, Roles, meeting
+from pair import SIDES, Pair, Roles, meeting
 
 from protocol.agent import AgentSession, SessionSettings
 from protocol.errors import Refusal
@@ -99,7 +99,8 @@ def _fly(session: AgentSession, count: int) -> dict[str, Any]:
             raise AssertionError(f"step {step}: a pose that is not due, or torn: {poses.raw.tolist()}")
         if not (poses.step == step).all() or session.steps != step:
             raise AssertionError(f"step {step}: lost or doubled, poses of {poses.step.tolist()}")
-    return {"steps": session.steps, "refused": refused, "seconds": time.monotonic() - began}
+    seconds = round(time.monotonic() - began, 1)
+    return {"exchange": session.exchange, "steps": session.steps, "refused": refused, "seconds": seconds}
 
 
 def _is_refused(session: AgentSession, commands: CommandBatch) -> bool:
@@ -115,13 +116,18 @@ def _is_refused(session: AgentSession, commands: CommandBatch) -> bool:
     raise AssertionError("a command that is no number was not refused")
 
 
-def run_steps(count: int, transport: str) -> dict[str, Any]:
-    """Fly `count` checked steps over a transport; both sides' counts.
+def run_steps(count: int, transport: str, exchange: str) -> dict[str, Any]:
+    """Fly `count` checked steps over a transport, exchanged in one way by both sides; both sides' counts.
 
     Raises:
         AssertionError: a side found something that was not due, or the counts differ.
     """
-    roles = Roles(SessionSettings(LANES, 0.1, 0.025), CheckingPlant, lambda session: _fly(session, count))
+    roles = Roles(
+        SessionSettings(LANES, 0.1, 0.025),
+        CheckingPlant,
+        lambda session: _fly(session, count),
+        exchange=dict.fromkeys(SIDES, exchange),
+    )
     with meeting(transport) as rendezvous:
         ends = Pair(rendezvous, roles).finish()
     agent, physics = ends["agent"], ends["physics"]
@@ -131,4 +137,4 @@ def run_steps(count: int, transport: str) -> dict[str, Any]:
         raise AssertionError(
             f"{transport}: {agent.value['steps']} asked, {physics.value} integrated of {count}"
         )
-    return {"transport": transport, "integrated": physics.value, **agent.value}
+    return {"integrated": physics.value, **agent.value}
