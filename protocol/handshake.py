@@ -194,14 +194,16 @@ def part(view: memoryview, error: BaseException, peer: memoryview | None = None)
 
     `peer` is the other side's segment: what only passes on a farewell that stands there is of kind 1.
     """
-    passes_on = isinstance(error, (SessionError, HandshakeError)) and peer is not None and read_farewell(peer)[0]
+    passes_on = (
+        isinstance(error, (SessionError, HandshakeError)) and peer is not None and read_farewell(peer)[0]
+    )
     if passes_on or isinstance(error, PeerLost):
         write_farewell(view, Farewell.STOPPED, f"it gave up: {error}")
     elif isinstance(error, PeerViolation):
         write_farewell(view, Farewell.VIOLATION, str(error))
     elif isinstance(error, HandshakeError):
         write_farewell(view, Farewell.HANDSHAKE, str(error))
-    elif isinstance(error, (KeyboardInterrupt, SystemExit)):
+    elif not isinstance(error, Exception):  # KeyboardInterrupt, SystemExit, and what programs make of SIGTERM
         write_farewell(view, Farewell.STOPPED, f"it was told to stop ({type(error).__name__})")
     else:
         write_farewell(view, Farewell.FAILED, f"{type(error).__name__}: {error}")

@@ -109,6 +109,7 @@ def _physics_pid_reused(rig: Rig) -> None:
         if not physics.stand_in.started:
             raise Skip("the start of a process is not known on this system")
         physics.attach({"start_time": physics.stand_in.started - 1})
+        _await_turn(physics)
         ends(physics, time.monotonic(), "a header of a process that is gone")
 
 

@@ -207,3 +207,25 @@ def test_an_interrupted_agent_says_that_it_was_told_to_stop(physics: HandPhysics
     with pytest.raises(PeerLost, match="told to stop") as caught:
         Peer("agent", 0, 0, physics.command).check(2, "idle")
     assert caught.value.verdict is Verdict.LEFT
+
+
+class Terminated(BaseException):
+    """What a program may raise when it is told to stop."""
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (KeyboardInterrupt(), Farewell.STOPPED),
+        (SystemExit(143), Farewell.STOPPED),
+        (Terminated(), Farewell.STOPPED),
+        (ZeroDivisionError(), Farewell.FAILED),
+    ],
+)
+def test_a_farewell_tells_who_was_told_to_stop_from_who_failed(
+    error: BaseException, reason: Farewell
+) -> None:
+    """An exception that is no Exception is a request to end, whatever its name."""
+    view = memoryview(bytearray(layout.command_bytes(1)))
+    part(view, error)
+    assert read_farewell(view)[0] == reason
