@@ -132,7 +132,6 @@ def header_texts(rig: Rig) -> None:
         text = raw.rstrip(b"\0")
         demand(b"\0" not in text, name, "zero bytes behind the text's end alone", raw)
         demand(text.decode(errors="replace").encode() == text, name, "UTF-8", raw)
-    demand(agent.get_bytes("plant_name")[0] != 0, "plant_name", "a name", "an empty text")
 
 
 @server_rule(
