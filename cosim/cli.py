@@ -292,8 +292,34 @@ def ablate(variants: str | None, workers: int | None, as_json: bool, **options: 
 @click.option(
     "--training", is_flag=True, help="The speed of training instead: environment, PPO, past the paper."
 )
-def bench(as_json: bool, quick: bool, training: bool) -> None:
-    """Measure the protocol's round trip, the whole control loop and the start-up, side by side in one run."""
+@click.option(
+    "--protocol", is_flag=True, help="The protocol instead: against the field, the floor, idle, lanes."
+)
+@click.option(
+    "--png", type=click.Path(path_type=Path), metavar="FILE", help="With --protocol: draw all round trips."
+)
+@click.option("--only", metavar="A,B,...", help="With --protocol: these ways alone [default: all].")
+def bench(
+    as_json: bool, quick: bool, training: bool, protocol: bool, png: Path | None, only: str | None
+) -> None:
+    """Measure the protocol's round trip, the whole control loop and the start-up, side by side in one run.
+
+    \b
+    cosim bench --quick
+    cosim bench --protocol --png round_trips.png     against UDP, Pipe, ZeroMQ, gRPC, iceoryx2, PyBullet, C
+    """
+    if training and protocol:
+        raise click.UsageError("--training and --protocol: expected one of them, found both")
+    if not protocol and (png is not None or only is not None):
+        raise click.UsageError(
+            f"--{'png' if png is not None else 'only'} is an option of --protocol, which is not given"
+        )
+    if protocol:
+        from cosim.bench_protocol import bench_protocol
+
+        names = tuple(name.strip() for name in only.split(",")) if only is not None else ()
+        bench_protocol(as_json=as_json, quick=quick, png=png, only=names)
+        return
     from cosim.bench import bench as run
 
     run(as_json=as_json, quick=quick, training=training)
@@ -387,6 +413,7 @@ def conformance(as_list: bool, as_json: bool, **options: Any) -> None:
     cosim conformance --server "python -m physics_server"
     cosim conformance --server ./server --transport file --level core,lanes --junit conformance.xml
     cosim conformance --agent "python -m protocol.conformance.toy_agent" --json
+    cosim conformance --agent "cosim launch --max-steps 30 --connect" --level core
     """
     from cosim.conformance import ConformanceOptions
     from cosim.conformance import conformance as run
