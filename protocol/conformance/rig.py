@@ -11,6 +11,7 @@ import shlex
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from contextlib import suppress
@@ -105,6 +106,8 @@ class Rig:
     """What a rule works with: it starts peers and makes rendezvous, and clears everything away at its end."""
 
     def __init__(self, command: str, transport: str = "shm", timeout: float = 10.0) -> None:
+        if sys.platform == "win32":
+            raise SessionError("the conformance kit ends programs by POSIX process groups: run it on Linux or macOS")
         if transport not in TRANSPORTS:
             raise SessionError(f"transport: expected one of {', '.join(TRANSPORTS)}, found {transport!r}")
         self.command = command

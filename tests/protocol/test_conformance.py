@@ -25,7 +25,7 @@ from protocol.states import TRANSITIONS, Event, State
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
-PYTHON = shlex.join(["env", f"PYTHONPATH={ROOT}", sys.executable])
+PYTHON = shlex.join(["env", f"PYTHONPATH={ROOT}", "OPENBLAS_NUM_THREADS=1", sys.executable])
 TOY = f"{PYTHON} -m protocol.conformance.toy_server"
 
 NO_WALLS = {
