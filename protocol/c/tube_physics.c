@@ -367,7 +367,8 @@ static void leave(session *s)
         release(&s->pose->farewell, s->ending == TUBE_END_LOST ? TUBE_FAREWELL_STOPPED : (int64_t)s->ending);
     }
     if (s->pose != NULL && tube_agent_is_dead(&s->segments))
-        tube_remove_names(&s->segments);
+        for (int tries = 100; tries > 0 && !tube_remove_names(&s->segments); tries--)
+            sleep_s(0.005);
     tube_close(&s->segments);
     free(s->commands);
     free(s->resets);

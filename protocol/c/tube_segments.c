@@ -141,8 +141,7 @@ tube_look tube_look_for_session(tube_segments *segments, bool patient)
         return TUBE_LOOK_UNFINISHED;
     if (magic == 0 || tube_agent_is_dead(segments)) {
         map(pose, PROT_READ);
-        if (lock(command))
-            tube_remove_names(segments);
+        tube_remove_names(segments);
         return TUBE_LOOK_NOTHING;
     }
     const bool left = __atomic_load_n(&header->farewell, __ATOMIC_ACQUIRE) != TUBE_FAREWELL_NONE;
@@ -159,13 +158,19 @@ tube_look tube_look_for_session(tube_segments *segments, bool patient)
     return TUBE_LOOK_CLAIMED;
 }
 
-void tube_remove_names(const tube_segments *segments)
+bool tube_remove_names(const tube_segments *segments)
 {
-    // `.pose` first: as long as `.cmd` has its name, no new agent makes a `.pose`.
-    const tube_segment *both[] = {&segments->pose, &segments->command};
-    for (int i = 0; i < 2; i++)
-        if (both[i]->descriptor >= 0 && is_named(both[i]))
-            unlink(both[i]->path);
+    // Under the lock of `.cmd` no newer name takes its place; `.pose` first: as long as `.cmd` has its name, no new
+    // agent makes a `.pose`.
+    const tube_segment *command = &segments->command, *pose = &segments->pose;
+    if (!lock(command))
+        return false;
+    if (is_named(command)) {
+        if (pose->descriptor >= 0 && is_named(pose))
+            unlink(pose->path);
+        unlink(command->path);
+    }
+    return true;
 }
 
 void tube_close(tube_segments *segments)

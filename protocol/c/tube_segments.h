@@ -40,8 +40,9 @@ bool tube_agent_is_dead(const tube_segments *segments);
 // Start of this process in the unit of the header's start_time; 0 where that is not known.
 int64_t tube_start_time(void);
 
-// Removes both names, unless they stand for newer segments by now.
-void tube_remove_names(const tube_segments *segments);
+// Removes both names, unless they stand for newer segments by now; false while another process has the lock of
+// `.cmd`, which a process that is just dead may have for a moment longer.
+bool tube_remove_names(const tube_segments *segments);
 
 // Unmaps both, which gives up the locks.
 void tube_close(tube_segments *segments);

@@ -19,7 +19,7 @@ namespace TubeCosim
         // Unmaps; removes both names if the agent is dead, so that segments never outlive the run.
         public void Leave()
         {
-            if (Opening.AgentIsDead(Command))
+            if (Opening.AgentIsDead(Command) && Command.LockToRemove(Opening.CreationGraceMs))
             {
                 Pose.RemoveAndDispose(); // first: a segment that stands alone is a .cmd, which tells whose it was
                 Command.RemoveAndDispose();
@@ -39,7 +39,7 @@ namespace TubeCosim
         private const string PoseSuffix = ".pose";
         private const string Unfinished = "a header that is not finished";
         private const int HeaderBytes = 2048;
-        private const long CreationGraceMs = 500;
+        internal const long CreationGraceMs = 500;
 
         private readonly Rendezvous rendezvous;
         private readonly Stopwatch unfinished = new Stopwatch();
@@ -65,8 +65,10 @@ namespace TubeCosim
             }
             try
             {
+                // The agent makes `.pose` before its magic, and another session's may stand there before and after.
+                bool finished = command.Size >= HeaderBytes && command.Acquire(Layout.Command.Magic) != 0;
                 pose = Segment.Open(rendezvous, PoseSuffix, true);
-                if (!IsOnOffer(command, pose))
+                if (!IsOnOffer(command, pose) || !finished || !command.NameStands())
                     return null;
                 Claim(pose);
                 Segments segments = new Segments(command, pose);
@@ -109,7 +111,7 @@ namespace TubeCosim
             else
                 return true; // also with a foreign magic, which the handshake names
             bool abandoned = unfinished.ElapsedMilliseconds >= CreationGraceMs || (finished && AgentIsDead(command));
-            if (abandoned && command.Lock()) // an agent that is writing its header, or replacing these, holds it
+            if (abandoned && command.LockToRemove(0)) // an agent that is writing its header, or replacing these, holds it
             {
                 if (pose != null)
                     pose.RemoveAndDispose();

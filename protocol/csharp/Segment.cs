@@ -5,6 +5,7 @@
 // moving or dropping an access. Acquire and Release are what Volatile.Read and Volatile.Write do for a variable.
 
 using System;
+using System.Diagnostics;
 using System.IO;
 using System.IO.MemoryMappedFiles;
 using System.Runtime.InteropServices;
@@ -185,6 +186,18 @@ namespace TubeCosim
             }
         }
 
+        // Claims a dead agent's segment, so that no newer one takes its name until it is removed; false where the name
+        // stands for a newer one already, or where another process keeps the lock, which one that is just dead may
+        // have for a moment longer.
+        public bool LockToRemove(long patienceMs)
+        {
+            Stopwatch waited = Stopwatch.StartNew();
+            bool locked = Lock();
+            for (; !locked && waited.ElapsedMilliseconds < patienceMs; locked = Lock())
+                Thread.Sleep(5);
+            return locked && NameStands();
+        }
+
         public long Read(int offset)
         {
             return Marshal.ReadInt64(start, offset);
@@ -301,7 +314,7 @@ namespace TubeCosim
         }
 
         // Whether the name still stands for what is mapped here: a new agent may have replaced it.
-        private bool NameStands()
+        public bool NameStands()
         {
             if (OnWindows || !File.Exists(name))
                 return OnWindows;
