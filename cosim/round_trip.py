@@ -1,9 +1,9 @@
-"""Round trips of one command and one pose: the protocol against a pipe and loopback UDP, in one run.
+"""Timing round trips of one command and one pose: through the protocol's session, a pipe and loopback UDP.
 
-Every way carries the same payload, a command row of 8 and a pose row of 16 float64, packed and unpacked on
-both sides, to a second process that does nothing else. The protocol is measured through its whole session,
-with all its checks; the others as bare as the standard library allows. On two cores each side of the protocol
-has a core of its own; the others are left to the scheduler, which serves them better than cores of their own.
+Every way carries the same payload, a command row of 8 and a pose row of 16 float64, packed and unpacked on both
+sides. The protocol is measured through its whole session, with all its checks, against an engine that does nothing;
+the others as bare as the standard library allows. On two cores each side of the protocol has a core of its own; the
+others are left to the scheduler, which serves them better than cores of their own, unless their name says polling.
 """
 
 from __future__ import annotations
@@ -13,10 +13,9 @@ import os
 import socket
 import statistics
 import struct
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from multiprocessing.connection import Connection
@@ -24,19 +23,27 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cosim.supervise import PhysicsProcess
+from cosim.supervise import PhysicsProcess, physics_command
 from protocol.agent import AgentSession, SessionSettings
+from protocol.compiled_choice import ENVIRONMENT
 from protocol.plant import COMMAND_WORDS, POSE_WORDS, CommandBatch, ResetBatch
 
 COMMAND: Final = struct.Struct(f"<{COMMAND_WORDS}d")
 POSE: Final = struct.Struct(f"<{POSE_WORDS}d")
 ROW: Final = (1.0, 0.0, 0.0, 1.0, 0.9, 0.0, 0.0, 0.0)
+ZEROS: Final = (0.0,) * (POSE_WORDS - COMMAND_WORDS)
+"""What a peer adds to a command to answer it."""
 
 DT: Final = 0.1
-PHYSICS_DT: Final = 1.0 / 240.0
+PATIENCE_S: Final = 5.0
+"""How long a peer may take to end by itself."""
 
 Exchange = Callable[[], object]
+Way = Callable[[], AbstractContextManager[Exchange]]
+"""A way to make round trips; a peer that it starts lives as long as its context."""
+Samples = NDArray[np.float64]
 Quantiles = dict[str, float]
 
 
@@ -47,42 +54,60 @@ def measure(samples: int, repeats: int) -> dict[str, Quantiles]:
         samples: round trips of one repeat.
         repeats: how often the ways are measured in turn.
     """
-    cores = sorted(os.sched_getaffinity(0))
-    one = {cores[0]}
-    ways: dict[str, tuple[Callable[[], AbstractContextManager[Exchange]], set[int]]] = {
-        "shm_two_cores": (partial(_session, cores[:2]), set(cores[:2])),
-        "pipe": (_pipe, set(cores[:2])),
-        "udp": (_udp, set(cores[:2])),
-        "shm_one_core": (partial(_session, cores[:1]), one),
-        "udp_one_core": (_udp, one),
+    both = two_cores()
+    one = both[:1]
+    ways: dict[str, tuple[Way, Sequence[int]]] = {
+        "shm_two_cores": (partial(session, both), both),
+        "pipe": (pipe, both),
+        "udp": (udp, both),
+        "shm_one_core": (partial(session, one), one),
+        "udp_one_core": (udp, one),
     }
     found: dict[str, list[Quantiles]] = {name: [] for name in ways}
     for _ in range(repeats):
-        for name, (way, affinity) in ways.items():
-            with _pinned(affinity), way() as exchange:
-                found[name].append(_quantiles(exchange, samples))
-    return {name: _medians(rows) for name, rows in found.items()}
+        for name, (way, cores) in ways.items():
+            with pinned(cores), way() as exchange:
+                found[name].append(quantiles(time_exchanges(exchange, samples)))
+    return {name: medians(rows) for name, rows in found.items()}
 
 
-def _medians(rows: list[Quantiles]) -> Quantiles:
-    return {key: round(statistics.median(row[key] for row in rows), 3) for key in rows[0]}
+def two_cores() -> list[int]:
+    """The first two cores of this process, or its one."""
+    return sorted(os.sched_getaffinity(0))[:2]
 
 
-def _quantiles(exchange: Exchange, samples: int) -> Quantiles:
+def time_exchanges(exchange: Exchange, samples: int, seconds: float = float("inf")) -> Samples:
+    """Time round trips, after a tenth of them to warm up, until there are so many or so much time has passed (us)."""
     clock = time.perf_counter_ns
     taken = np.empty(samples)
+    until = clock() + int(min(seconds, 1e6) * 1e9)
     for _ in range(samples // 10):
         exchange()
+        if clock() > until:
+            break
     for i in range(samples):
         started = clock()
         exchange()
-        taken[i] = clock() - started
-    p50, p99, p999 = np.quantile(taken, (0.5, 0.99, 0.999)) / 1e3
+        ended = clock()
+        taken[i] = ended - started
+        if ended > until:
+            return taken[: i + 1] / 1e3
+    return taken / 1e3
+
+
+def quantiles(samples: Samples) -> Quantiles:
+    """Median, 99th and 99.9th percentile of times in microseconds."""
+    p50, p99, p999 = np.quantile(samples, (0.5, 0.99, 0.999))
     return {"p50_us": float(p50), "p99_us": float(p99), "p999_us": float(p999)}
 
 
+def medians(rows: Sequence[Quantiles]) -> Quantiles:
+    """The median of each figure over repeats."""
+    return {key: round(statistics.median(row[key] for row in rows), 3) for key in rows[0]}
+
+
 @contextmanager
-def _pinned(cores: set[int]) -> Iterator[None]:
+def pinned(cores: Sequence[int]) -> Iterator[None]:
     """This process and the children that it starts on these cores alone."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, cores)
@@ -93,36 +118,89 @@ def _pinned(cores: set[int]) -> Iterator[None]:
 
 
 @contextmanager
-def _session(cores: list[int]) -> Iterator[Exchange]:
-    """The protocol's whole session, on the first core, against an engine that does nothing, on the last one."""
-    rendezvous = f"shm:cosim-bench-{os.getpid()}-{time.monotonic_ns()}"
-    command = [sys.executable, "-m", "physics_server", "--engine", "null"]
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        PhysicsProcess(command, rendezvous, Path(folder)) as server,
-        AgentSession.open(rendezvous, SessionSettings(1, DT, PHYSICS_DT), watch=server.watch) as session,
-    ):
-        resets = ResetBatch.zeros(1)
-        resets.selected[0] = 1
-        resets.parameters[0, : len(session.description.defaults)] = session.description.defaults
-        session.reset(resets)
-        os.sched_setaffinity(0, cores[:1])
-        os.sched_setaffinity(server.pid, cores[-1:])
+def session(
+    cores: Sequence[int], exchange: str | None = None, command: Sequence[str] | None = None
+) -> Iterator[Exchange]:
+    """The protocol's whole session, one lane: the agent on the first core, the physics process on the last one.
+
+    Args:
+        cores: one or two of them.
+        exchange: "stdlib" or "compiled" for every side in Python; None leaves it to them.
+        command: of the physics process, but for the rendezvous; None is ours with an engine that does nothing.
+    """
+    with open_session(cores, 1, exchange, command) as (agent, _):
         commands = CommandBatch.zeros(1)
-        row = commands.raw[0]
+        sent = commands.raw.data.cast("B")
+        received = agent.reset(sound_resets(agent)).raw.data.cast("B")
 
-        def exchange() -> object:
-            row[:] = ROW
-            return session.step(commands).raw[0].tolist()
+        def one() -> object:
+            COMMAND.pack_into(sent, 0, *ROW)
+            agent.step(commands)
+            return POSE.unpack_from(received)
 
-        yield exchange
+        yield one
 
 
 @contextmanager
-def _pipe() -> Iterator[Exchange]:
+def open_session(
+    cores: Sequence[int], lanes: int, exchange: str | None = None, command: Sequence[str] | None = None
+) -> Iterator[tuple[AgentSession, PhysicsProcess]]:
+    """A session of so many lanes, as `session` has one, and its physics process."""
+    rendezvous = f"shm:cosim-bench-{os.getpid()}-{time.monotonic_ns()}"
+    # One inner step a control step: the time of an engine is not what is measured.
+    settings = SessionSettings(lanes, DT, DT)
+    command = command or (*physics_command(None), "--engine", "null")
+    with (
+        _exchanging_by(exchange),
+        tempfile.TemporaryDirectory() as folder,
+        PhysicsProcess(command, rendezvous, Path(folder)) as server,
+        AgentSession.open(rendezvous, settings, watch=server.watch) as agent,
+    ):
+        server.serving = True
+        before = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, cores[:1])
+        os.sched_setaffinity(server.pid, cores[-1:])
+        try:
+            yield agent, server
+        finally:
+            os.sched_setaffinity(0, before)
+
+
+@contextmanager
+def _exchanging_by(exchange: str | None) -> Iterator[None]:
+    """Demand a way of exchanging steps of this process and of those that it starts."""
+    before = os.environ.get(ENVIRONMENT)
+    if exchange is not None:
+        os.environ[ENVIRONMENT] = exchange
+    try:
+        yield
+    finally:
+        if exchange is not None:
+            os.environ.pop(ENVIRONMENT)
+            if before is not None:
+                os.environ[ENVIRONMENT] = before
+
+
+def sound_resets(agent: AgentSession) -> ResetBatch:
+    """Resets of all lanes at the origin, with the plant's default parameters."""
+    resets = ResetBatch.zeros(agent.lanes)
+    resets.selected[:] = 1
+    resets.parameters[:, : len(agent.description.defaults)] = agent.description.defaults
+    return resets
+
+
+def sound_commands(lanes: int) -> CommandBatch:
+    """The payload's command in every lane."""
+    commands = CommandBatch.zeros(lanes)
+    commands.raw[:] = ROW
+    return commands
+
+
+@contextmanager
+def pipe() -> Iterator[Exchange]:
     """`multiprocessing.Pipe` with the payload as bytes, not pickled."""
     ours, theirs = multiprocessing.get_context("spawn").Pipe()
-    with _child(_pipe_peer, theirs), ours:
+    with child(_pipe_peer, theirs), ours:
         theirs.close()
 
         def exchange() -> object:
@@ -134,18 +212,34 @@ def _pipe() -> Iterator[Exchange]:
 
 
 def _pipe_peer(connection: Connection) -> None:
-    zeros = (0.0,) * (POSE_WORDS - COMMAND_WORDS)
     with connection:
         try:
             while True:
-                connection.send_bytes(POSE.pack(*COMMAND.unpack(connection.recv_bytes()), *zeros))
+                connection.send_bytes(POSE.pack(*COMMAND.unpack(connection.recv_bytes()), *ZEROS))
         except EOFError:
             return
 
 
 @contextmanager
-def _udp() -> Iterator[Exchange]:
+def udp() -> Iterator[Exchange]:
     """Connected UDP sockets on the loopback interface."""
+    with udp_sockets() as (ours, theirs), child(_udp_peer, theirs):
+        # A socket with a deadline polls before every call; the first exchange needs one, the others are bare.
+        ours.send(COMMAND.pack(*ROW))
+        ours.recv(POSE.size)
+        ours.settimeout(None)
+
+        def exchange() -> object:
+            ours.send(COMMAND.pack(*ROW))
+            return POSE.unpack(ours.recv(POSE.size))
+
+        yield exchange
+        ours.send(b"")
+
+
+@contextmanager
+def udp_sockets() -> Iterator[tuple[socket.socket, socket.socket]]:
+    """Two sockets that are connected to each other, with a deadline."""
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as theirs,
@@ -155,36 +249,25 @@ def _udp() -> Iterator[Exchange]:
             end.settimeout(10.0)
         ours.connect(theirs.getsockname())
         theirs.connect(ours.getsockname())
-        with _child(_udp_peer, theirs):
-            ours.send(COMMAND.pack(*ROW))
-            ours.recv(POSE.size)
-            # A socket with a deadline polls before every call; measure bare calls.
-            ours.settimeout(None)
-
-            def exchange() -> object:
-                ours.send(COMMAND.pack(*ROW))
-                return POSE.unpack(ours.recv(POSE.size))
-
-            yield exchange
-            ours.send(b"")
+        yield ours, theirs
 
 
 def _udp_peer(ours: socket.socket) -> None:
     ours.settimeout(None)
-    zeros = (0.0,) * (POSE_WORDS - COMMAND_WORDS)
     with ours:
         while len(datagram := ours.recv(POSE.size)) == COMMAND.size:
-            ours.send(POSE.pack(*COMMAND.unpack(datagram), *zeros))
+            ours.send(POSE.pack(*COMMAND.unpack(datagram), *ZEROS))
 
 
 @contextmanager
-def _child(target: Callable[[Any], None], end: object) -> Iterator[None]:
-    process = multiprocessing.get_context("spawn").Process(target=target, args=(end,), daemon=True)
+def child(target: Callable[..., None], *arguments: Any, patience: float = 0.2) -> Iterator[None]:
+    """A second process, which is expected to end by itself, and is made to if it does not."""
+    process = multiprocessing.get_context("spawn").Process(target=target, args=arguments, daemon=True)
     process.start()
     try:
         yield
     finally:
-        process.join(0.2)
+        process.join(patience)
         if process.is_alive():
             process.terminate()
             process.join()

@@ -1,0 +1,132 @@
+"""The benchmark of the protocol measures, says what it cannot, and draws; how fast anything is, is not asserted."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from cosim import native
+from cosim.bench_protocol import LANES, LOOK, Effort, _lanes, measure_protocol
+from cosim.cli import cosim
+from cosim.errors import CosimError, OutputError
+from cosim.idle import idle_percent
+from cosim.protocol_table import protocol_table
+from cosim.round_trip import two_cores
+
+BRIEF = Effort(samples=80, seconds=0.05, repeats=1, idle_s=0.1)
+
+needs_cc = pytest.mark.skipif(
+    native.shutil.which("cc") is None, reason="no C compiler: apt-get install gcc libc6-dev"
+)
+needs_two_cores = pytest.mark.skipif(len(two_cores()) < 2, reason="this machine has one core")
+
+
+def silent(_text: str) -> None:
+    """Say nothing."""
+
+
+@needs_two_cores
+def test_the_command_prints_one_json_object_of_the_documented_fields(tmp_path: Path) -> None:
+    """With --json stdout is the figures; each way has quantiles in order and its ratio over UDP."""
+    picture = tmp_path / "trips.png"
+    arguments = [
+        "bench",
+        "--protocol",
+        "--quick",
+        "--json",
+        "--only",
+        "session_stdlib, udp",
+        "--png",
+        str(picture),
+    ]
+    done = CliRunner().invoke(cosim, arguments)
+    assert done.exit_code == 0, done.output
+    figures = json.loads(done.stdout)
+    assert set(figures) == {"machine", "effort", "round_trip", "skipped", "png"}
+    assert set(figures["round_trip"]) == {"session_stdlib", "udp"}
+    for row in figures["round_trip"].values():
+        assert 0 < row["p50_us"] <= row["p99_us"] <= row["p999_us"]
+    trips = figures["round_trip"]
+    expected = trips["session_stdlib"]["p50_us"] / trips["udp"]["p50_us"]
+    assert trips["session_stdlib"]["over_udp"] == pytest.approx(expected, abs=1e-3)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "session_stdlib" in protocol_table(figures)
+
+
+def test_options_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    """An unknown way, a figure in no folder, and options without --protocol are one sentence each."""
+    with pytest.raises(CosimError, match=r"--only: expected some of session_stdlib, .*found 'smoke_signals'"):
+        measure_protocol(LOOK, ("smoke_signals",), silent)
+    for arguments in (["--only", "udp"], ["--png", "x.png"], ["--protocol", "--training"]):
+        done = CliRunner().invoke(cosim, ["bench", *arguments])
+        assert done.exit_code == 2, done.output
+    missing = tmp_path / "nowhere" / "x.png"
+    done = CliRunner().invoke(cosim, ["bench", "--protocol", "--png", str(missing)])
+    assert isinstance(done.exception, OutputError)
+
+
+def test_a_library_that_is_missing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A way whose library is not installed is left out, with what to install."""
+    for name in ("zmq", "iceoryx2", "grpc"):
+        monkeypatch.setitem(sys.modules, name, None)
+    figures, samples = measure_protocol(BRIEF, ("pyzmq", "iceoryx2", "grpc_unary"), silent)
+    assert set(figures["skipped"]) == {"pyzmq", "iceoryx2", "grpc_unary"}
+    assert all("pip install 'tube-cosim[bench]'" in why for why in figures["skipped"].values())
+    assert samples == {}
+    assert "not measured:" in protocol_table(figures)
+
+
+@needs_two_cores
+def test_every_way_of_the_standard_library_and_of_pybullet_makes_round_trips() -> None:
+    """They measure what they are asked to and leave no process behind."""
+    names = ("pipe", "semaphores", "udp_polling", "pybullet_server")
+    figures, samples = measure_protocol(BRIEF, names, silent)
+    assert figures["skipped"] == {}
+    assert set(samples) == set(names)
+    assert all((rows > 0).all() and len(rows) for rows in samples.values())
+
+
+@needs_cc
+@needs_two_cores
+def test_peers_and_floor_in_c_are_compiled_on_the_spot(tmp_path: Path) -> None:
+    """The C server is measured through the whole session, and the floor is below it."""
+    figures, _ = measure_protocol(BRIEF, ("session_c_stdlib",), silent)
+    floor = native.run_floor(native.build_floor(tmp_path), two_cores(), 1, 500)
+    assert 0 < floor["p50_us"] < figures["round_trip"]["session_c_stdlib"]["p50_us"]
+
+
+def test_a_missing_compiler_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Without compilers the peers in C and C# are left out, with what to install."""
+    monkeypatch.setattr(native.shutil, "which", lambda _tool: None)
+    figures, _ = measure_protocol(BRIEF, ("session_c_stdlib", "session_csharp_stdlib"), silent)
+    assert "apt-get install gcc" in figures["skipped"]["session_c_stdlib"]
+    assert "apt-get install mono-mcs" in figures["skipped"]["session_csharp_stdlib"]
+    with pytest.raises(native.MissingToolError, match="cc is not installed"):
+        native.build_floor(tmp_path)
+
+
+@needs_two_cores
+def test_lanes_are_measured_from_1_to_256() -> None:
+    """Each number of lanes has its time of a step and, as part of it, of transport; one lane is its own measure."""
+    table = _lanes(BRIEF, {"session_compiled": "to be quick"})
+    assert list(table) == ["stdlib"]
+    assert [row["lanes"] for row in table["stdlib"]] == list(LANES)
+    assert table["stdlib"][0]["transport_over_one_lane"] == 1.0
+    for row in table["stdlib"]:
+        assert row["transport_us"] < row["step_us"]
+        assert row["transport_us_per_lane"] == pytest.approx(row["transport_us"] / row["lanes"], abs=1e-3)
+
+
+def test_a_waiting_pair_hardly_takes_a_core() -> None:
+    """Both sides of a session sleep while nothing happens."""
+    skipped: dict[str, str] = {}
+    idle = idle_percent(0.3, skipped)
+    if skipped:
+        pytest.skip(skipped["idle_percent"])
+    assert set(idle) == {"physics", "agent"}
+    assert all(np.isfinite(share) and 0.0 <= share < 50.0 for share in idle.values())
