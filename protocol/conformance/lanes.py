@@ -57,7 +57,7 @@ def _rows(lanes: int) -> None:
         f"rows-of-{lanes}",
         Level.LANES,
         "3",
-        f"of {lanes} lanes each has rows of its own",
+        f"with N = {lanes} every lane has rows of its own",
     )
     def rows(rig: Rig) -> None:
         agent = rig.open(lanes=lanes)

@@ -118,7 +118,7 @@ def _in_words(times: list[float]) -> str:
 
 
 @server_rule(
-    "latency", Level.PERFORMANCE, "10", "latency of a step, one lane and one inner step", required=False
+    "latency", Level.PERFORMANCE, "10", "how long a step of one lane and one inner step takes", required=False
 )
 def latency(rig: Rig) -> str:
     """Information, beside loopback UDP in the same run."""
