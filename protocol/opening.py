@@ -36,6 +36,8 @@ _HEADER_BYTES: Final = 2048
 _DEAD_AGENT: Final = "stale segments of a dead agent"
 _UNFINISHED: Final = "a header that is not finished"
 _TOO_SHORT: Final = "a file too short for a segment"
+_LEFT_BEHIND: Final = (_DEAD_AGENT, _UNFINISHED)
+"""What a dead agent leaves: it goes as soon as its lock does, which may outlive it for a moment."""
 
 
 def create_segments(rendezvous: Rendezvous, lanes: int) -> Segments:
@@ -122,17 +124,20 @@ def attach_segments(rendezvous: Rendezvous, timeout: float, launcher: int | None
     """
     launched = UNKNOWN if launcher is None else start_time(launcher)
     began = whole = time.monotonic()
+    orphaned: float | None = None
     found = "nothing of that name"
     while True:
         now = time.monotonic()
-        orphaned = launcher is not None and life(launcher, launched) is Life.DEAD
-        segments, news = _try_attach(rendezvous, patient=not orphaned and now - whole < CREATION_GRACE_S)
+        if orphaned is None and launcher is not None and life(launcher, launched) is Life.DEAD:
+            orphaned = now
+        patient = orphaned is None and now - whole < CREATION_GRACE_S
+        segments, news = _try_attach(rendezvous, patient)
         if segments is not None:
             return segments
         if news != _UNFINISHED:
             whole = now  # the last moment without a half-written header
         found = news or found
-        if orphaned:
+        if orphaned is not None and (news not in _LEFT_BEHIND or now - orphaned > CREATION_GRACE_S):
             how = f"ended before a session was offered at {rendezvous}"
             raise PeerLost(f"launcher (pid {launcher})", how, Verdict.EXITED, 0, "attach")
         if now - began > timeout:
@@ -156,17 +161,20 @@ def remove_if_dead(segments: Segments) -> None:
         time.sleep(LOOK_AGAIN_S)
 
 
-def _remove_names(command: Segment, pose: Segment | None) -> bool:
+def _remove_names(command: Segment, pose: Segment | None, rendezvous: Rendezvous | None = None) -> bool:
     """Remove a session's names, which no living agent needs; False where another holds the lock of `command`.
 
     Under that lock, so that no newer names take their place in the meantime, and `command` last, so that nobody
-    finds a `.pose` without one and thinks it his to replace.
+    finds a `.pose` without one and thinks it his to replace. A pose segment that was not given a size before its
+    agent died cannot be opened: it is found by `rendezvous`.
     """
     if not command.lock():
         return False
     if command.stands():
         if pose is not None:
             pose.unlink()
+        elif rendezvous is not None:
+            remove_empty(rendezvous, POSE_SUFFIX)
         command.unlink()
     return True
 
@@ -189,7 +197,7 @@ def _try_attach(rendezvous: Rendezvous, patient: bool) -> tuple[Segments | None,
         news = _not_on_offer(command)
         pose = open_segment(rendezvous, POSE_SUFFIX)  # after the magic: before it, this may be a dead agent's
         if news == _DEAD_AGENT or (news == _UNFINISHED and not patient):
-            _remove_names(command, pose)
+            _remove_names(command, pose, rendezvous)
         if news:
             return None, news
         if pose is None or not command.stands():  # or a newer agent's

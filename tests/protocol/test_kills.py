@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from protocol.errors import PeerLost
-from protocol.memory import create_segment, parse_rendezvous
+from protocol.memory import create_segment, parse_rendezvous, segment_path
 from protocol.physics import serve
 from protocol.toy import ToyPlant
 
@@ -66,16 +66,18 @@ def test_an_agent_that_is_killed_while_it_leaves_has_nothing_left(
     assert server.wait(20) == (0 if last == "goodbye" else 3)
 
 
-@pytest.mark.parametrize("size", [0, 8192])
-def test_an_agent_that_is_killed_while_it_creates_has_nothing_left(rendezvous: str, size: int) -> None:
-    """A segment without a header, or without a size, of an agent that is dead: its physics process removes it."""
+@pytest.mark.parametrize("sizes", [{".cmd": 0}, {".cmd": 8192}, {".cmd": 8192, ".pose": 0}])
+def test_an_agent_that_is_killed_while_it_creates_has_nothing_left(
+    rendezvous: str, sizes: dict[str, int]
+) -> None:
+    """Segments without a header, or without a size, of an agent that is dead: its physics process removes them."""
     agent = subprocess.Popen([sys.executable, "-c", ""])
     place = parse_rendezvous(rendezvous)
-    if size:
-        create_segment(place, ".cmd", size).close()
-    else:
-        folder = Path("/dev/shm") if place.kind == "shm" else Path("/")
-        (folder / f"{place.stem}.cmd").touch()
+    for suffix, size in sizes.items():
+        if size:
+            create_segment(place, suffix, size).close()
+        else:
+            segment_path(place, suffix).touch()
     agent.wait()
     with pytest.raises(PeerLost, match=r"ended before a session was offered"):
         serve(rendezvous, ToyPlant(), attach_timeout=20.0, launcher=agent.pid)
