@@ -189,6 +189,8 @@ class PhysicsSession:
             PeerViolation: the agent broke the protocol.
             Exception: whatever the plant raised.
         """
+        if self.answer_at_once(1):
+            return True
         if FENCE is not None:
             FENCE()
         number = self.number + 1
@@ -229,13 +231,16 @@ class PhysicsSession:
             if refusal is not None:
                 raise refusal
 
-    def _publish(self, status: int, engine_ns: int, number: int) -> None:
-        """Publish the reply to request `number`, the private poses with it."""
+    def _publish(self, status: int, engine_ns: int, number: int, refusal: Refusal | None = None) -> None:
+        """Publish the reply to request `number`, the private poses with it, or a refusal."""
         words, reply = self._words, self._reply
         if words[_DOORBELL] != number or words[_BEGIN] != number:
             raise PeerViolation(_EARLY.format(number))
         reply[_REPLY_BEGIN] = number
-        self._wire_poses[:] = self._pose_bytes
+        if refusal is None:
+            self._wire_poses[:] = self._pose_bytes
+        else:
+            self._write_refusal(refusal)
         layout.REPLY_REST.pack_into(self._pose, _REPLY_REST_AT, status, self.steps, engine_ns, number)
         if FENCE is not None:
             FENCE()
@@ -244,13 +249,14 @@ class PhysicsSession:
 
     def _publish_refusal(self, refusal: Refusal, number: int) -> None:
         self._pose_bytes[:] = self._wire_poses  # a plant that refuses half-way may have written some of them
-        self._reply[_REPLY_BEGIN] = number
+        self._publish(Status.REFUSED, 0, number, refusal)
+
+    def _write_refusal(self, refusal: Refusal) -> None:
         layout.write_i64(self._pose, POSE["refusal_code"], refusal.code)
         layout.write_i64(self._pose, POSE["refusal_lane"], refusal.lane)
         layout.write_text(self._pose, POSE["refusal_field"], refusal.field)
         layout.write_text(self._pose, POSE["refusal_expected"], refusal.expected)
         layout.write_text(self._pose, POSE["refusal_found"], refusal.found)
-        self._publish(Status.REFUSED, 0, number)
 
     def _answer_rare(self, op: int, step: int, number: int) -> bool:
         """Answer every request but a step."""

@@ -8,9 +8,9 @@ import pytest
 
 from protocol import layout
 from protocol.agent import AgentSession, SessionSettings
-from protocol.errors import PeerLost, PeerViolation, SessionError, Verdict
+from protocol.errors import PeerLost, PeerViolation, Refusal, SessionError, Verdict
 from protocol.handshake import Answer, part, read_farewell, read_offer, write_answer, write_farewell
-from protocol.layout import COMMAND, POSE, Farewell, Field, Op
+from protocol.layout import COMMAND, FAREWELL, POSE, Farewell, Field, Op
 from protocol.physics import PhysicsSession
 from protocol.plant import CommandBatch, PoseBatch, ResetBatch
 from protocol.toy import ToyPlant
@@ -105,6 +105,21 @@ def test_physics_notices_a_request_that_comes_early(agent: HandAgent, words: dic
     with pytest.raises(PeerViolation, match="early request before request 3 was answered"):
         agent.ask(3, Op.STEP, 2)
     assert layout.read_i64(agent.pose, POSE["doorbell"]) == 2
+
+
+def test_an_early_request_is_noticed_before_a_refusal_is_written(agent: HandAgent) -> None:
+    """The pose segment stays as the last reply left it, also where the request was to be refused."""
+
+    def refuse_late() -> None:
+        put(agent.command, COMMAND, begin=4)
+        raise Refusal("engine", "a mood to step", "none", 0)
+
+    agent.plant.meddle = refuse_late
+    before = bytes(agent.pose[: FAREWELL[0].offset]), bytes(agent.pose[POSE["refusal_code"].offset :])
+    with pytest.raises(PeerViolation, match="early request before request 3 was answered"):
+        agent.ask(3, Op.STEP, 2)
+    after = bytes(agent.pose[: FAREWELL[0].offset]), bytes(agent.pose[POSE["refusal_code"].offset :])
+    assert after == before
 
 
 def test_physics_answers_nothing_after_a_goodbye(agent: HandAgent) -> None:
