@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -123,6 +124,7 @@ class Desk:
         self._words[_OWN_COMMANDS] = commands.raw.ctypes.data
 
 
+@cache
 def load_kernels(may_compile: bool) -> Kernels:
     """Load the machine code that an earlier process left, or compile it, which takes a second or two.
 

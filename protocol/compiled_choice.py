@@ -65,12 +65,6 @@ def choose(who: str, *, may_compile: bool) -> Choice:
     return choice
 
 
-def availability() -> str:
-    """What a session of this process would take, in words, without loading anything."""
-    wish = os.environ.get(ENVIRONMENT, AUTO)
-    return _obstacle(wish) or f"{COMPILED}, {ENVIRONMENT} is {wish}"
-
-
 def _obstacle(wish: str) -> str:
     """Why machine code is not even tried, or nothing."""
     if wish == STDLIB:
