@@ -42,7 +42,7 @@ class Kill:
     noticed_s: float
     """From the kill to the survivor's error."""
     queued_s: float
-    """Of that, the time that the two processes waited for a core."""
+    """Of that, the time that the processes waited for a core: the victim to die, the survivor to look."""
     step: int
     """Control step that the survivor's error names."""
     fault: str
@@ -101,11 +101,13 @@ def kill_once(chance: random.Random, ways: tuple[str, ...]) -> Kill:
             pair = Pair(rendezvous, roles)
             time.sleep(max(0.0, began + after - time.monotonic()))
             before = {side: queued_seconds(pid) for side, pid in pair.pids.items()}
+            our_own = queued_seconds(os.getpid())
             killed = time.monotonic()
             pair.signal(victim, signal.SIGKILL)
+            queued = queued_seconds(os.getpid()) - our_own
             while not pair.ended(victim):
                 time.sleep(0.0005)
-            queued = queued_seconds(pair.pids[victim]) - before[victim]
+            queued += queued_seconds(pair.pids[victim]) - before[victim]
             end = pair.finish()[survivor]
             if end is not None:
                 noticed, queued = end.at - killed, queued + end.queued - before[survivor]
@@ -133,7 +135,7 @@ def run_kills(count: int, seed: int) -> dict[str, Any]:
     while sum(kill.counts or bool(kill.fault) for kill in kills) < count:
         kills.append(kill_once(chance, ways))
     noticed = sorted(kill.noticed_s for kill in kills if kill.counts)
-    net = sorted(kill.noticed_s - kill.queued_s for kill in kills if kill.counts)
+    net = sorted(max(0.0, kill.noticed_s - kill.queued_s) for kill in kills if kill.counts)
     return {
         "seed": seed,
         "kills": len(kills),
