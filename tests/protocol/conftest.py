@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from protocol.agent import AgentSession, SessionSettings
+from protocol.compiled_choice import ENVIRONMENT
 from protocol.liveness import describe_exit
 from protocol.plant import PARAMETER_INDEX, CommandBatch, ResetBatch
 from protocol.toy import DEFAULTS
@@ -117,19 +118,28 @@ def watch() -> Callable[[subprocess.Popen[str]], Callable[[], str | None]]:
 Open = Callable[..., AgentSession]
 
 
-@pytest.fixture(params=["twin", "shm", "file"])
+@pytest.fixture(params=["twin", "shm", "file", "compiled"])
 def open_session(
-    request: pytest.FixtureRequest, name: str, trace: Path, tmp_path: Path, start: Start, peers: ModuleType
+    request: pytest.FixtureRequest,
+    name: str,
+    trace: Path,
+    tmp_path: Path,
+    start: Start,
+    peers: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[Open]:
-    """Open a session over a RecordingPlant: in memory, and with a second process over either transport."""
+    """Open a session over a RecordingPlant: in memory, with a second process over either transport, and compiled."""
     opened: list[AgentSession] = []
+    if request.param == "compiled":
+        pytest.importorskip("numba", reason="numba is not installed: pip install numba")
+    monkeypatch.setenv(ENVIRONMENT, "compiled" if request.param == "compiled" else "stdlib")
 
     def run(lanes: int = 1, dt: float = 0.1, inner_steps: int = 4, tube_slots: int = 4) -> AgentSession:
         settings = SessionSettings(lanes, dt, dt / inner_steps, tube_slots)
         if request.param == "twin":
             opened.append(open_twin(peers.RecordingPlant(trace), settings))
         else:
-            place = f"shm:{name}" if request.param == "shm" else f"file:{tmp_path / 'session'}"
+            place = f"file:{tmp_path / 'session'}" if request.param == "file" else f"shm:{name}"
             start("serve", place)
             opened.append(AgentSession.open(place, settings, attach_timeout=PATIENCE_S))
         return opened[-1]
