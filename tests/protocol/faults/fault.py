@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Callable
 
 from protocol import layout
+from protocol.errors import Refusal
 from protocol.layout import POSE
 from protocol.physics import PhysicsSession
 from protocol.plant import Plant, PlantDescription
@@ -56,8 +57,13 @@ def around_publish(wrap: Callable[[Publish, PhysicsSession, int, int, int], None
     """Put `wrap(publish, session, status, engine_ns, number)` in place of what publishes replies."""
     publish = PhysicsSession._publish
 
-    def replacement(session: PhysicsSession, status: int, engine_ns: int, number: int) -> None:
-        wrap(publish, session, status, engine_ns, number)
+    def replacement(
+        session: PhysicsSession, status: int, engine_ns: int, number: int, *refusal: Refusal
+    ) -> None:
+        def whole(session: PhysicsSession, status: int, engine_ns: int, number: int) -> None:
+            publish(session, status, engine_ns, number, *refusal)
+
+        wrap(whole, session, status, engine_ns, number)
 
     PhysicsSession._publish = replacement  # type: ignore[method-assign]
 
