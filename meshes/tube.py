@@ -15,6 +15,7 @@ from meshes.errors import CentrelineError
 from meshes.formats import Axes, AxesChoice
 from meshes.geometry import Floats
 from meshes.obj import read_bytes
+from meshes.scale import MeanRadius
 from meshes.wall import Wall, read_wall, to_world
 
 if TYPE_CHECKING:
@@ -81,13 +82,6 @@ class Tube:
         return self.wall.scale
 
 
-@dataclass(frozen=True)
-class MeanRadius:
-    """A scale that makes a tube so wide: the mean, along the axis, of the wall's mean distance in each section."""
-
-    metres: float
-
-
 def read_tube(
     mesh: str | Path,
     centreline: str | Path | None = None,
@@ -107,8 +101,9 @@ def read_tube(
         scale: metres in one unit of both files, see `read_wall`.
         start_end: the end of the centreline where the drone starts; "first" is the one whose vertex stands
             first in the file, or the found one's first.
-        entry: (3,) where to start, in the coordinates of the file, see `find_centreline`.
-        exit: (3,) where to end.
+        entry: where to start: a point (3,) in the coordinates of the file, or the number of an opening, see
+            `find_centreline`.
+        exit: where to end.
 
     Raises:
         MeshReadError: either file cannot be read.
@@ -128,12 +123,13 @@ def read_tube(
 
 
 def _find(wall: Wall, entry: ArrayLike | None, exit: ArrayLike | None) -> FoundCentreline:
-    from meshes.centreline_finding import (
-        find_centreline,
-    )  # here, since scipy takes a while that others do not need
+    # Here, since scipy takes a while that others do not need.
+    from meshes.centreline_finding import find_centreline
 
     ends = (
-        None if end is None else wall.to_world(np.reshape(end, (1, 3)).astype(float))[0]
+        end
+        if end is None or isinstance(end, int)
+        else wall.to_world(np.reshape(end, (1, 3)).astype(float))[0]
         for end in (entry, exit)
     )
     return find_centreline(wall, *ends)
