@@ -1,6 +1,6 @@
 """Any words in headers, requests and replies: a typed end, no hang, and nothing integrated that was not asked for.
 
-What is expected of each comes from an oracle that was written from the specification alone, section 7 above all.
+What is expected of each comes from an oracle that was written from the specification alone (`tests/helpers`).
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +19,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from specified import Oracle, common_is_sound
 
 from protocol import layout
 from protocol.agent import AgentSession, SessionSettings
@@ -31,7 +30,7 @@ from protocol.memory import parse_rendezvous
 from protocol.opening import create_segments
 from protocol.physics import PhysicsSession
 from protocol.plant import CommandBatch, Plant, PlantDescription, PoseBatch, ResetBatch, TubeReference
-from protocol.toy import DEFAULTS, SPEED_MAX, ToyPlant
+from protocol.toy import DEFAULTS, ToyPlant
 
 LANES, TUBE_SLOTS = 2, 3
 SETTINGS = SessionSettings(LANES, 0.1, 0.025, TUBE_SLOTS)
@@ -79,25 +78,6 @@ def spoil(view: memoryview, changes: dict[str, bytes], fields: dict[str, Field])
 
 # ---------------------------------------------------------------------------------------------------------------
 # Headers
-
-
-def common_is_sound(view: memoryview, word: bytes, size: int) -> bool | None:
-    """Whether the specification takes the common part of a header; None where rounding decides."""
-    at = {place.name: place for place in HEADER}
-
-    def number(name: str) -> int:
-        return int(struct.unpack_from("<q", view, at[name].offset)[0])
-
-    dt, inner = struct.unpack_from("<2d", view, at["dt"].offset)
-    if not (bytes(view[:8]) == word and number("version_major") == 1 and 1 <= number("lanes") <= 65536):
-        return False
-    if not (0.0 < dt < math.inf and 0.0 < inner < math.inf and 1 <= number("inner_steps") <= 1_000_000):
-        return False
-    off = abs(number("inner_steps") * Fraction(inner) - Fraction(dt)) / Fraction(dt)
-    strides = [number(f"{name}_stride") for name in ("command", "pose", "reset")] == [64, 128, 384]
-    if not (strides and 1 <= number("tube_slots") <= 65536 and number("segment_bytes") == size):
-        return False
-    return None if abs(off - Fraction(1, 10**9)) < Fraction(1, 10**11) else off < Fraction(1, 10**9)
 
 
 header_words = st.dictionaries(st.sampled_from([place.name for place in HEADER]), words, max_size=3)
@@ -196,119 +176,6 @@ class CountingPlant(Plant):
         """Nothing to give up."""
 
 
-def command_fault(row: bytes) -> int:
-    """Code of the first fault of a command row, 0 where there is none."""
-    x, y, z, speed, compensation = struct.unpack_from("<5d", row)
-    if not all(map(math.isfinite, (x, y, z))):
-        return 1
-    if abs(x * x + y * y + z * z - 1.0) > 1e-6:
-        return 3
-    for value, most in ((speed, SPEED_MAX), (compensation, 2.0)):
-        if not math.isfinite(value):
-            return 1
-        if not 0.0 <= value <= most:
-            return 2
-    return 4 if any(row[40:]) else 0
-
-
-POSITIVE, NOT_NEGATIVE = {0, 1, 2, 3, 4}, {5, 7, 8, 9, 10, 13, 17}
-
-
-def parameters_fault(values: tuple[float, ...], reserved: bytes) -> int:
-    """Code of the first fault of a reset's parameters, by the table of section 3."""
-    for word, value in enumerate(values):
-        if not math.isfinite(value):
-            return 1
-        low = value <= 0.0 if word in POSITIVE else value < 0.0 if word in NOT_NEGATIVE else False
-        if low or (word == 6 and value not in (0.0, 1.0)) or (word == 12 and not 0.0 <= value <= 1.0):
-            return 2
-    return 4 if any(reserved) else 0
-
-
-def reset_fault(row: bytes, tubes: set[int]) -> int:
-    """Code of the first fault of a reset row that is selected."""
-    state, (tube,) = struct.unpack_from("<13d", row), struct.unpack_from("<q", row, 104)
-    if not all(map(math.isfinite, state)):
-        return 1
-    if tube != -1 and tube not in tubes:
-        return 6
-    if not abs(sum(x * x for x in state[3:7]) - 1.0) <= 1e-6:
-        return 3
-    return parameters_fault(struct.unpack_from("<18d", row, 128), row[128 + 18 * 8 :])
-
-
-@dataclass
-class Oracle:
-    """What the specification says of a session so far."""
-
-    tubes: set[int] = field(default_factory=set)
-    lane_tubes: list[int | None] = field(default_factory=lambda: [None] * LANES)
-    steps: int = 0
-
-    def answer(self, op: int, command: memoryview) -> tuple[int, int]:
-        """Code (0 done) and lane of the answer that is due to a request whose words are in order."""
-        if op == 5:
-            return 0, -1
-        code, lane = {1: self._step, 2: self._reset, 3: self._register, 4: self._release}[op](command)
-        if code == 0:
-            self.steps += op == 1
-        return code, lane
-
-    def _step(self, command: memoryview) -> tuple[int, int]:
-        if None in self.lane_tubes:
-            return 5, self.lane_tubes.index(None)
-        rows = bytes(command[6464 : 6464 + 64 * LANES])
-        faults = [command_fault(rows[64 * lane :][:64]) for lane in range(LANES)]
-        return next(((code, lane) for lane, code in enumerate(faults) if code), (0, -1))
-
-    def _reset(self, command: memoryview) -> tuple[int, int]:
-        rows = bytes(command[6464 + 64 * LANES :])
-        chosen = {}
-        for lane in range(LANES):
-            row = rows[384 * lane :][:384]
-            (selected,) = struct.unpack_from("<q", row, 120)
-            code = 0 if selected == 0 else 2 if selected != 1 else reset_fault(row, self.tubes)
-            if code:
-                return code, lane
-            if selected:
-                chosen[lane] = struct.unpack_from("<q", row, 104)[0]
-        for lane, tube in chosen.items():
-            self.lane_tubes[lane] = tube
-        return 0, -1
-
-    def _register(self, command: memoryview) -> tuple[int, int]:
-        index, axes, scale = struct.unpack_from("<2qd", command, 2048)
-        (size,) = struct.unpack_from("<q", command, 2104)
-        if not 0 <= index < TUBE_SLOTS:
-            return 7, -1
-        if axes not in (0, 1):
-            return 9, -1
-        if not 0.0 < scale < math.inf:
-            return 2, -1
-        path = bytes(command[2112 : 2112 + size]) if 1 <= size <= 4096 else b"\0"
-        try:
-            path.decode()
-        except UnicodeDecodeError:
-            return 9, -1
-        if b"\0" in path:
-            return 9, -1
-        if index in self.tubes:
-            return 7, -1
-        self.tubes.add(index)
-        return 0, -1
-
-    def _release(self, command: memoryview) -> tuple[int, int]:
-        (index,) = struct.unpack_from("<q", command, 2048)
-        if not 0 <= index < TUBE_SLOTS:
-            return 7, -1
-        if index not in self.tubes:
-            return 6, -1
-        if index in self.lane_tubes:
-            return 8, self.lane_tubes.index(index)
-        self.tubes.discard(index)
-        return 0, -1
-
-
 payloads = st.dictionaries(
     st.tuples(st.integers(0, LANES - 1), st.integers(0, 47)),
     words
@@ -381,7 +248,7 @@ def test_any_sequence_of_requests_is_answered_as_specified(drawn: list[Any]) -> 
     command = memoryview(bytearray(layout.command_bytes(LANES)))
     pose = memoryview(bytearray(layout.pose_bytes(LANES)))
     AgentSession(command, pose, SETTINGS)
-    plant, oracle = CountingPlant(), Oracle()
+    plant, oracle = CountingPlant(), Oracle(LANES, TUBE_SLOTS)
     physics = PhysicsSession(command.toreadonly(), pose, plant)
     for op, payload, tube, wrong in drawn:
         number, asked, rows = physics.number + 1, list(plant.asked), bytes(pose[layout.pose_rows(LANES)])
