@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import pytest
 
+from protocol import waiting
 from protocol.errors import PeerLost, Verdict
 from protocol.liveness import Life, describe_exit, how_ended, life, start_time
 from protocol.waiting import Peer, Waiter, spin
@@ -45,6 +46,34 @@ def test_a_wait_ends_with_the_doorbell(words: memoryview, delay: float) -> None:
     timer.start()
     assert waiter(0, 1, "step") == 7
     timer.join()
+
+
+def test_polling_in_vain_is_given_up_but_for_a_trial(
+    words: memoryview, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the peer rings only once this side yields, waits soon yield at once, and poll again now and then."""
+    waiter = make_waiter(words)
+    monkeypatch.setattr(waiting, "give_way", lambda: words.__setitem__(400, words[400] + 1))
+    polls = []
+    for number in range(2 * waiting.TRIAL):
+        polls.append(waiter.polls)
+        assert waiter(number, 1, "step") == number + 1
+    trials = [number for number, count in enumerate(polls) if count == waiting.POLLS]
+    assert trials == [*range(waiting.IN_VAIN), waiting.TRIAL]
+    assert set(polls) == {1, waiting.POLLS}
+
+
+def test_an_answer_that_polling_finds_forgives_what_was_in_vain(
+    words: memoryview, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Waits in vain that are not one after the other leave polling as it is."""
+    waiter = make_waiter(words)
+    monkeypatch.setattr(waiting, "give_way", lambda: words.__setitem__(400, words[400] + 1))
+    for number in range(20):
+        if number % 2:
+            words[400] = number + 1
+        assert waiter(number, 1, "step") == number + 1
+        assert waiter.polls == waiting.POLLS
 
 
 def test_a_deadline_is_kept(words: memoryview) -> None:
