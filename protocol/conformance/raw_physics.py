@@ -22,6 +22,7 @@ from protocol.handshake import magic, read_farewell, write_farewell
 from protocol.layout import (
     COMMAND,
     COMMAND_MAGIC,
+    LANES_MAX,
     POSE,
     POSE_MAGIC,
     REQUEST,
@@ -29,6 +30,7 @@ from protocol.layout import (
     Field,
     Op,
     Status,
+    command_bytes,
     command_rows,
     pose_bytes,
     pose_rows,
@@ -131,6 +133,7 @@ class RawPhysics:
         self._command, self._pose = _await_offer(rendezvous, process, timeout)
         self.pose, self.command = self._pose.view, self._command.view.toreadonly()
         self.lanes = read_i64(self.command, COMMAND["lanes"])
+        self._check_sizes()
         self._plant = ToyPlant()
         self._poses = PoseBatch.zeros(self.lanes)
         self._reset_lanes: set[int] = set()
@@ -151,6 +154,18 @@ class RawPhysics:
         self._pose.close()
 
     # --- handshake ---
+
+    def _check_sizes(self) -> None:
+        """Raise a Failure where the header's lanes do not fit into the segments."""
+        sizes = len(self.command), len(self.pose)
+        if not (
+            1 <= self.lanes <= LANES_MAX and sizes >= (command_bytes(self.lanes), pose_bytes(self.lanes))
+        ):
+            self.close()
+            expected = f"1 to {LANES_MAX}, for which both segments are large enough"
+            raise Failure(
+                "lanes of the agent's header", expected, f"{self.lanes}, in segments of {sizes} bytes"
+            )
 
     def begin_header(self) -> None:
         """Take the lock, by a new stand-in, and write whose header this will be."""
@@ -261,7 +276,11 @@ class RawPhysics:
             self._plant.reset(request.resets, self._poses)
             self._reset_lanes.update(np.flatnonzero(request.resets.selected).tolist())
         elif request.op == Op.STEP:
-            self._plant.step(request.commands, self._poses)
+            try:
+                self._plant.step(request.commands, self._poses)
+            except FloatingPointError as error:
+                self.say_farewell(Farewell.FAILED, str(error))
+                raise Failure(f"the flight at {request.name}", "states that stay finite", error) from error
             self.steps += 1
         elif request.op == Op.REGISTER_TUBE:
             self._tubes.add(index)

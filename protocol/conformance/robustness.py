@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import signal
 import time
+from collections.abc import Callable
 from typing import Final
 
 from protocol.conformance.raw_agent import RawAgent
@@ -58,11 +59,13 @@ def _covers(event: Event) -> tuple[tuple[State, Event], ...]:
     "agent-killed",
     ROBUSTNESS,
     "10",
-    f"an agent killed in any state is noticed within 100 ms (+{ALLOWANCE_S * 1e3:.0f}): names removed, server ends",
+    "an agent killed in any state, or gone without a word, is noticed within 100 ms "
+    f"(+{ALLOWANCE_S * 1e3:.0f}): names removed, server ends",
     covers=_covers(Event.LOSS),
 )
 def _agent_killed(rig: Rig) -> str:
     took = {state: _dies(rig, state, StandIn.kill) for state in FAULT_STATES}
+    took[State.READY] = max(took[State.READY], _dies(rig, State.READY, StandIn.leave))
     return _slowest(took)
 
 
@@ -76,7 +79,9 @@ def _agent_killed_at_work(rig: Rig) -> str:
     with at_work(rig) as s:
         demand(s.agent.get("doorbell") < s.agent.number, "the engine", "at work", "done")
         s.stand_in.kill()
+        until = time.monotonic() + rig.timeout
         while s.agent.get("doorbell") < s.agent.number and segments_left(s.agent.rendezvous):
+            demand(time.monotonic() < until, "the engine", f"done within {rig.timeout:g} s", "still at work")
             time.sleep(0.001)
         since = time.monotonic()
         _await_removal(s, _BOUND)
@@ -94,9 +99,8 @@ def _slowest(took: dict[State, float]) -> str:
     return f"noticed after {took[state] * 1e3:.0f} ms at most ({state.name})"
 
 
-def _dies(rig: Rig, state: State, how: object) -> float:
+def _dies(rig: Rig, state: State, how: Callable[[StandIn], None]) -> float:
     """Let the agent die in a state; return how long the names stood after that (s)."""
-    assert callable(how)
     with scene(rig, state) as s:
         how(s.stand_in)
         since = s.go_on()
@@ -120,22 +124,16 @@ def _await_removal(s: Scene, bound: float) -> None:
     "agent-pid-reused", ROBUSTNESS, "10", "a process of the agent's pid but another start is not the agent"
 )
 def _agent_pid_reused(rig: Rig) -> None:
-    agent = rig.agent()
-    stand_in = hand_over(agent)
+    agent, other = rig.agent(), StandIn()
     try:
-        if not stand_in.started:
+        if not other.started:
             raise Skip("the start of a process is not known on this system")
-        agent.offer(pid=stand_in.pid, start_time=stand_in.started - 1)
-        stand_in.close()  # its lock is given up: who held it is dead, and the pid is another's
-        other = StandIn()
-        try:
-            agent.put(pid=other.pid, start_time=other.started - 1)
-            rig.start()
-            await_no_segments(rig.rendezvous, rig.timeout)
-        finally:
-            other.close()
+        hand_over(agent).close()  # the lock is free, as that of a dead agent is
+        agent.offer(pid=other.pid, start_time=other.started - 1)
+        rig.start()
+        await_no_segments(rig.rendezvous, rig.timeout)
     finally:
-        stand_in.close()
+        other.close()
 
 
 @server_rule(

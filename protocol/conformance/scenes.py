@@ -126,12 +126,16 @@ def ready(rig: Rig, inner_steps: int = 4) -> tuple[RawAgent, PeerProcess, StandI
     """Open a session whose agent is a stand-in, with its lane reset and a step done."""
     agent = rig.agent(inner_steps=inner_steps, rendezvous=rig.new_rendezvous())
     stand_in = hand_over(agent)
-    agent.offer(pid=stand_in.pid, start_time=stand_in.started)
-    server = rig.start(agent.rendezvous)
-    agent.attend(server)
-    agent.await_header()
-    expect("status of a reset", agent.reset(resets(agent)).status, 0)
-    expect("status of a step", agent.step(commands(agent)).status, 0)
+    try:
+        agent.offer(pid=stand_in.pid, start_time=stand_in.started)
+        server = rig.start(agent.rendezvous)
+        agent.attend(server)
+        agent.await_header()
+        expect("status of a reset", agent.reset(resets(agent)).status, 0)
+        expect("status of a step", agent.step(commands(agent)).status, 0)
+    except BaseException:
+        stand_in.close()
+        raise
     return agent, server, stand_in
 
 

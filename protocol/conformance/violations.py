@@ -34,9 +34,9 @@ def _covers(*states: State) -> tuple[tuple[State, Event], ...]:
 
 def _ends(s: Scene, what: str) -> None:
     """Let the server find what the agent has done, and demand that it ends the session as specified."""
-    before = without_farewell(s.agent.pose)
+    before, answered = without_farewell(s.agent.pose), s.agent.get("doorbell")
     s.go_on()
-    kind, text = _await_farewell(s, f"{what} {s.where}")
+    kind, text = _await_farewell(s, answered, f"{what} {s.where}")
     demand(kind == Farewell.VIOLATION, f"farewell after {what} {s.where}", "kind 3", f"{kind} {text!r}")
     demand(bool(text), f"text of the farewell after {what} {s.where}", "what was seen", "an empty text")
     await_end(s.server, f"after {what} {s.where}")
@@ -53,9 +53,8 @@ def _ends(s: Scene, what: str) -> None:
     )
 
 
-def _await_farewell(s: Scene, after: str) -> tuple[int, str]:
-    """Wait for the server's farewell or its end; its answer is a failure at once."""
-    answered = s.agent.get("doorbell")
+def _await_farewell(s: Scene, answered: int, after: str) -> tuple[int, str]:
+    """Wait for the server's farewell or its end; a reply behind number `answered` is a failure at once."""
     until = time.monotonic() + (s.agent.timeout if s.state is State.OFFERED else LEAVING_S)
     while not s.agent.farewell()[0] and s.server.watch() is None:
         demand(s.agent.get("doorbell") == answered, f"the server after {after}", "a farewell 3", "a reply")
