@@ -107,7 +107,9 @@ class Rig:
 
     def __init__(self, command: str, transport: str = "shm", timeout: float = 10.0) -> None:
         if sys.platform == "win32":
-            raise SessionError("the conformance kit ends programs by POSIX process groups: run it on Linux or macOS")
+            raise SessionError(
+                "the conformance kit ends programs by POSIX process groups: run it on Linux or macOS"
+            )
         if transport not in TRANSPORTS:
             raise SessionError(f"transport: expected one of {', '.join(TRANSPORTS)}, found {transport!r}")
         self.command = command
