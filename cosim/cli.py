@@ -96,6 +96,26 @@ def export(run: Path, kind: str, output: Path | None) -> None:
     click.echo(path)
 
 
+@cosim.command(short_help="Write one HTML page of runs and evaluations, which needs no network.")
+@click.argument("sources", type=click.Path(path_type=Path), nargs=-1, required=True, metavar="RUN...")
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="FILE.html", help="Page [default: RUN/report.html]."
+)
+def report(sources: tuple[Path, ...], out: Path | None) -> None:
+    """Write one HTML page with replay in 3-D, plots, timings, settings and hashes; it opens from disk.
+
+    RUN is a run folder, or the results.json of `cosim evaluate --out`. Several runs are overlaid; an evaluation's
+    failures are linked to those of their runs that are given.
+
+    \b
+    cosim report runs/2026-...
+    cosim report runs/ppo runs/pure-pursuit --out comparison.html
+    """
+    from cosim.report import report as write
+
+    click.echo(write(sources, out))
+
+
 @cosim.command(short_help="Check a recorded run, and replay its commands through fresh physics.")
 @click.argument("run", type=click.Path(path_type=Path))
 @click.option("--mesh", type=click.Path(path_type=Path), metavar="PATH", help="Where its tube is now.")

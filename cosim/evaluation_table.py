@@ -28,7 +28,7 @@ WORLDS: Final = {
 
 def table_lines(report: Row) -> Iterator[str]:
     """The table: for each level, or value of a sweep and level, the paper's rows and those that were flown."""
-    yield from _wrapped(_heading(report))
+    yield from _wrapped(heading(report))
     for (value, level), group in groupby(report["rows"], key=lambda row: (row.get("value"), row["level"])):
         flown = list(group)
         setting = flown[0].get("setting")
@@ -42,7 +42,7 @@ def table_lines(report: Row) -> Iterator[str]:
         for row in flown:
             yield _line(f"  {row['policy']}", row, width)
     yield ""
-    yield from _wrapped(_legend(report))
+    yield from _wrapped(legend(report))
 
 
 def _wrapped(lines: Iterator[str]) -> Iterator[str]:
@@ -50,7 +50,8 @@ def _wrapped(lines: Iterator[str]) -> Iterator[str]:
         yield from textwrap.wrap(line, WIDTH, subsequent_indent="  ", break_on_hyphens=False)
 
 
-def _heading(report: Row) -> Iterator[str]:
+def heading(report: Row) -> Iterator[str]:
+    """What was flown, how often and under what."""
     yield (
         f"{report['episodes']} episodes a level, seed {report['seed']}, the same tubes and draws for all, flown "
         f"{WORLDS[report['engine']]}"
@@ -97,7 +98,7 @@ def _text(value: Any) -> str:
     return write_value(tuple(value) if isinstance(value, list) else value).replace(":", " to ")
 
 
-def _legend(report: Row) -> Iterator[str]:
+def legend(report: Row) -> Iterator[str]:
     """What was flown, and what each pilot knew."""
     yield (
         "success, exit, collision, time-out in %; 95 %: Wilson's interval of the success; Q: centring and alignment; "
@@ -120,7 +121,7 @@ def _legend(report: Row) -> Iterator[str]:
 
 def map_lines(report: Row) -> Iterator[str]:
     """Success (%) over gain and compensation, a block for each pilot and level."""
-    yield from _wrapped(_heading(report))
+    yield from _wrapped(heading(report))
     rows = report["rows"]
     gains = sorted({row["gain"] for row in rows})
     cells = {(row["policy"], row["level"], row["gain"], row["compensation"]): row["success"] for row in rows}
@@ -131,4 +132,4 @@ def map_lines(report: Row) -> Iterator[str]:
         for c in sorted({row["compensation"] for row in rows}, reverse=True):
             yield f"{c:12g}      " + "".join(f"{100 * cells[name, level, gain, c]:7.1f}" for gain in gains)
     yield ""
-    yield from _wrapped(_legend(report))
+    yield from _wrapped(legend(report))

@@ -1,0 +1,84 @@
+"""What the page of `cosim report` holds of an evaluation: its table, its failures, and which were flown again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cosim.errors import RunError
+from cosim.evaluation_table import heading, legend
+from cosim.pilots import PURE_PURSUIT, TUNED_PURSUIT
+from cosim.runs import Run
+
+
+def read_results(path: Path) -> dict[str, Any]:
+    """Read what `cosim evaluate --out` wrote.
+
+    Raises:
+        RunError: the file cannot be read or holds something else.
+    """
+    try:
+        found = json.loads(path.read_text())
+    except OSError as error:
+        raise RunError(f"{path}: expected results of an evaluation, found none ({error.strerror})") from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise RunError(f"{path}: expected JSON, found text that is not ({error})") from error
+    if not (isinstance(found, dict) and {"rows", "paper", "flown"} <= found.keys()):
+        raise RunError(f"{path}: expected rows and episodes of `cosim evaluate --out`, found neither")
+    return found
+
+
+def describe_evaluation(path: Path, results: Mapping[str, Any], runs: Sequence[Run]) -> dict[str, Any]:
+    """The table and the failures as JSON; of each failure, which of the runs flew it again.
+
+    Args:
+        path: of the results.
+        results: from `read_results`.
+        runs: that are on the same page.
+    """
+    flown = results["flown"]
+    failures = [episode for episode in flown if episode["outcome"] != "success"]
+    return {
+        "path": str(path),
+        "heading": list(heading(results)),
+        "legend": list(legend(results)),
+        "rows": results["rows"],
+        "paper": results["paper"],
+        "episodes": len(flown),
+        "failures": [
+            {
+                name: episode[name]
+                for name in (
+                    "policy",
+                    "level",
+                    "seed",
+                    "outcome",
+                    "steps",
+                    "progress",
+                    "min_clearance_m",
+                    "launch",
+                )
+            }
+            | {"repeats": episode["launch_repeats"], "run": _flown_again(episode, runs)}
+            for episode in failures
+        ],
+    }
+
+
+def _flown_again(episode: Mapping[str, Any], runs: Sequence[Run]) -> int | None:
+    """Number of the run of the same tube, start, pilot and draws; None where there is none."""
+    names = {episode["policy"], PURE_PURSUIT if episode["policy"] == TUNED_PURSUIT else episode["policy"]}
+    for number, run in enumerate(runs):
+        manifest, last = run.manifest, run.records[-1]
+        tube, drawn = manifest.get("tube"), manifest["conditions"]["drawn"]
+        if (
+            tube is not None
+            and (tube["level"], tube["seed"]) == (episode["level"], episode["seed"])
+            and names & {manifest["policy"]["name"], manifest["options"]["policy"]}
+            and all(drawn.get(name) == value for name, value in episode["conditions"].items())
+            and (not episode["launch_repeats"] or int(last["step"]) == episode["steps"])
+        ):
+            return number
+    return None

@@ -1,0 +1,66 @@
+"""A tube on the page of `cosim report`: few enough triangles, and where outwards is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.report_run import AddArray
+from cosim.scene import Scene
+from meshes.thinning import thin_surface
+
+Floats = NDArray[np.float64]
+
+AXIS_POINTS: Final = 1500
+"""Points of the axis that outwards is told by."""
+_PIECE: Final = 4096
+
+
+def describe_tube(scenes: Sequence[Scene], triangles: int, add: AddArray) -> dict[str, Any]:
+    """The tube of some scenes that share it, as JSON with the numbers of its arrays.
+
+    Args:
+        scenes: of the runs; the longest axis counts.
+        triangles: that it may have; a mesh of more is thinned.
+        add: takes the arrays.
+    """
+    axis = max((scene.axis for scene in scenes), key=len)
+    tube = scenes[0].tube
+    vertices, faces = thin_surface(tube.vertices, tube.faces, triangles)
+    return {
+        "vertices": add(vertices.astype(np.float32)),
+        "faces": add(faces.astype(np.uint16 if len(vertices) <= 2**16 else np.uint32)),
+        "outward": add(outward(vertices, axis)),
+        "axis": add(axis.astype(np.float32)),
+        "triangles": len(faces),
+        "triangles_flown": len(tube.faces),
+    }
+
+
+def outward(vertices: Floats, axis: Floats) -> NDArray[np.int8]:
+    """Direction from the axis to each vertex in its section, (V, 3) in units of 1/127, by which the tube is cut open.
+
+    Zero for vertices beyond the ends of the axis: that part of the tube was not flown, and stays closed.
+    """
+    axis = axis[:: -(-len(axis) // AXIS_POINTS)]
+    if len(axis) < 2:
+        return np.zeros(vertices.shape, np.int8)
+    tangent = np.gradient(axis, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    square = (axis**2).sum(axis=1)
+    found = np.empty((len(vertices), 3))
+    for start in range(0, len(vertices), _PIECE):
+        piece = vertices[start : start + _PIECE]
+        nearest = (square - 2.0 * piece @ axis.T).argmin(axis=1)
+        away = piece - axis[nearest]
+        along = np.einsum("ij,ij->i", away, tangent[nearest])
+        away -= along[:, None] * tangent[nearest]
+        width = np.linalg.norm(away, axis=1)
+        beyond = np.abs(along) > width
+        found[start : start + _PIECE] = np.where(
+            beyond[:, None], 0.0, away / np.maximum(width, 1e-12)[:, None]
+        )
+    return np.rint(127.0 * found).astype(np.int8)
