@@ -28,6 +28,7 @@ from cosim.errors import CosimError
 from cosim.idle import idle_percent
 from cosim.protocol_table import protocol_table
 from cosim.round_trip import Quantiles, Samples, Way
+from protocol.errors import ProtocolError
 
 LANES: Final = (1, 4, 16, 64, 256)
 EXCHANGES: Final = ("stdlib", "compiled")
@@ -99,7 +100,17 @@ def measure_protocol(
         say: told what is being measured.
 
     Returns:
-        The figures, ready for JSON, and the round trips of each way (us).
+        The round trips of each way (us), behind the figures, which are ready for JSON:
+
+        machine: system, processor, python, cores, load_average, date
+        effort: samples, repeats
+        round_trip: by way: p50_us, p99_us, p999_us, over_udp (its p50 over that of blocking UDP on as many cores)
+            and, on two cores, over_fastest_udp (blocking or polling)
+        floor: by number of lanes: quantiles of as many cache lines passed to and fro in C
+        idle_percent: physics, agent: of a core, while each waits for the other
+        lanes: for stdlib and compiled a row for each number: lanes, step_us, transport_us (without the engine's
+            own time), transport_us_per_lane, steps_per_second_per_lane, transport_over_one_lane
+        skipped: why a way or a part could not be measured, and what to do
     """
     skipped: dict[str, str] = {}
     with ExitStack() as stack:
@@ -141,7 +152,7 @@ def _entries(folder: Path, only: Sequence[str], skipped: dict[str, str]) -> dict
             continue
         try:
             command = build(folder)
-        except native.MissingToolError as error:
+        except CosimError as error:
             skipped |= dict.fromkeys(names, str(error))
             continue
         for name, exchange in zip(names, EXCHANGES, strict=True):
@@ -176,7 +187,7 @@ def _round_trips(
             except ImportError as error:
                 skipped[name] = f"{error.name} is not installed: pip install 'tube-cosim[bench]'"
                 continue
-            except CosimError as error:
+            except (CosimError, ProtocolError) as error:
                 skipped[name] = str(error)
                 continue
             found.setdefault(name, []).append(samples)
