@@ -1,42 +1,17 @@
-"""From what the user named to what is flown through: a tube from files or a generated one, conditions, parameters."""
+"""From what the user named to the terms of a flight: conditions, parameters, and options that fit each other."""
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any, Final, Literal
+from dataclasses import dataclass
 
 from agent_client.conditions import NAMES, PARAMETERS_OF, Conditions, Records, draw_conditions
-from agent_client.tubes import TubeRecipe, draw_tube
-from cosim.errors import CosimError, OutputError
+from agent_client.tubes import TubeRecipe
+from cosim.errors import CosimError
 from cosim.named_settings import idle_settings, option_name
-from cosim.options import SHIPPED_MESH, FlightOptions
-from cosim.pilots import existing_file
-from meshes.formats import Axes
-from meshes.geometry import Geometry
-from meshes.mesh_geometry import MeshGeometry
-from meshes.tube import INDUSTRIAL, read_tube
-from protocol.plant import PARAMETER_INDEX, PARAMETERS, TubeReference
-
-TUBE_FILES: Final = ("tube.obj", "tube_centerline.obj")
-"""Wall and centreline of a generated tube, in the run folder."""
-
-
-@dataclass(frozen=True)
-class Conduit:
-    """What is flown through."""
-
-    geometry: Geometry
-    """As perception sees it."""
-    reference: TubeReference
-    """Its wall, as physics is told of it."""
-    length: float
-    """Of the axis (m)."""
-    description: dict[str, Any]
-    """For the manifest: `mesh`, and `tube` where it was generated."""
+from cosim.options import FlightOptions
+from protocol.plant import PARAMETER_INDEX, PARAMETERS
 
 
 @dataclass(frozen=True)
@@ -91,12 +66,15 @@ def check_options(options: FlightOptions) -> None:
         raise CosimError(
             "--connect: a peer that you start has its own command and name; drop --server or --session"
         )
+    for name in ("entry", "exit"):
+        if options.centerline is not None and getattr(options, name) is not None:
+            raise CosimError(f"--{name}: --centerline has its own ends; drop one of them")
     if options.tube is None:
         for name in options.settings.tubes:
             raise CosimError(f"{option_name(name)}: only a generated tube has it; add --tube level=L,seed=N")
     else:
         usual = FlightOptions()
-        for name in ("mesh", "centerline", "axes", "scale", "start_end"):
+        for name in ("mesh", "centerline", "axes", "scale", "start_end", "entry", "exit"):
             if getattr(options, name) != getattr(usual, name):
                 raise CosimError(f"{option_name(name)}: --tube is a generated tube; drop one of them")
         if options.tube.length is not None and "lengths" in options.settings.tubes:
@@ -114,79 +92,6 @@ def setting_notes(options: FlightOptions, conditions: Conditions, recipe: TubeRe
     levels = () if options.tube is None else (options.tube.level,)
     for name, why in idle_settings(names, conditions, recipe, levels):
         yield f"{option_name(name)}: {why}"
-
-
-def find_mesh(options: FlightOptions) -> Path | None:
-    """The mesh that the options name, None for a generated tube.
-
-    Raises:
-        CosimError: no such file.
-    """
-    if options.tube is not None:
-        return None
-    return existing_file("mesh", options.mesh or SHIPPED_MESH, SHIPPED_MESH, INDUSTRIAL)
-
-
-def read_conduit(options: FlightOptions, mesh: Path) -> Conduit:
-    """The tube of a mesh and its centreline.
-
-    Raises:
-        MeshError: the mesh or its centreline cannot be used.
-    """
-    axes: Axes = "yup" if options.axes == "yup" else "zup"
-    start_end: Literal["first", "last"] = "last" if options.start_end == "last" else "first"
-    tube = read_tube(mesh, options.centerline, axes, options.scale, start_end)
-    reference = TubeReference(str(tube.path.resolve()), tube.axes, tube.scale, tube.sha256)
-    described = _describe(tube.path, reference, tube.centreline_path, tube.centreline_sha256, tube.length)
-    return Conduit(MeshGeometry([tube]), reference, tube.length, {"mesh": described, "tube": None})
-
-
-def generate_conduit(options: FlightOptions, recipe: TubeRecipe, folder: Path) -> Conduit:
-    """The tube that `cosim evaluate` draws for this level and seed; its wall and centreline are written to `folder`.
-
-    Physics reads the file, perception sees the swept curve itself: as in the evaluation, to the last bit.
-
-    Raises:
-        CurveError: no such tube was found.
-        OutputError: the folder holds such files, or cannot be written.
-    """
-    from cosim.walls import write_wall
-    from meshes.sweep import write_centreline_obj
-    from meshes.swept_geometry import SweptGeometry
-
-    chosen = options.tube
-    assert chosen is not None
-    if chosen.length is not None:
-        recipe = replace(recipe, lengths=(chosen.length,))
-    tube = draw_tube(chosen.level, (chosen.seed,), "evaluate", recipe)
-    wall, centreline = (folder / name for name in TUBE_FILES)
-    for path in (wall, centreline):
-        if path.exists():
-            raise OutputError(f"--out {folder}: expected a folder without {path.name}, found one")
-    try:
-        reference = write_wall(wall, tube)
-        write_centreline_obj(centreline, tube.points)
-    except OSError as error:
-        wall.unlink(missing_ok=True)
-        raise OutputError(f"{folder}: the tube cannot be written: {error.strerror}") from error
-    sha256 = hashlib.sha256(centreline.read_bytes()).hexdigest()
-    described = {"level": chosen.level, "seed": chosen.seed, "domain": "evaluate", "recipe": asdict(recipe)}
-    mesh = _describe(wall, reference, centreline, sha256, tube.length)
-    return Conduit(SweptGeometry([tube]), reference, tube.length, {"mesh": mesh, "tube": described})
-
-
-def _describe(
-    wall: Path, reference: TubeReference, centreline: Path | None, centreline_sha256: str, length: float
-) -> dict[str, Any]:
-    return {
-        "path": str(wall),
-        "sha256": reference.sha256,
-        "axes": reference.axes,
-        "scale": reference.scale,
-        "centreline": None if centreline is None else str(centreline),  # found from the wall
-        "centreline_sha256": centreline_sha256,
-        "length_m": length,
-    }
 
 
 def draw_flight_conditions(

@@ -21,18 +21,14 @@ from agent_client.settings import max_steps
 from agent_client.start import build_resets
 from agent_client.task import Outcome
 from cosim import __version__
+from cosim.conduits import Conduit, find_mesh, generate_conduit, read_conduit
 from cosim.errors import RunError, Terminated
 from cosim.folders import check_folder, new_folder
 from cosim.inputs import (
-    TUBE_FILES,
-    Conduit,
     FlightConditions,
     check_options,
     draw_flight_conditions,
-    find_mesh,
-    generate_conduit,
     parse_parameters,
-    read_conduit,
     setting_notes,
 )
 from cosim.live import LiveLine
@@ -128,10 +124,10 @@ def launch(
             process = stack.enter_context(PhysicsProcess(command, rendezvous, folder))
         if mesh is None:
             conduit = generate_conduit(options, recipe, folder)
-            stack.callback(_forget_unflown, folder)
         else:
-            conduit = read_conduit(options, mesh)
-        for note in (*pilot.notes, *conditions.notes):
+            conduit = read_conduit(options, mesh, folder, float(conditions.drawn["body_radius"][0]))
+        stack.callback(_forget_unflown, folder, conduit.written)
+        for note in (*conduit.notes, *pilot.notes, *conditions.notes):
             say(note)
         session = stack.enter_context(
             attached_session(offer, process=process, attach_timeout=options.attach_timeout)
@@ -167,11 +163,11 @@ def _label(options: FlightOptions, mesh: Path | None, choice: PilotChoice) -> st
     return f"{flown}-{choice.label[:60]}-seed{options.start_seed}"
 
 
-def _forget_unflown(folder: Path) -> None:
-    """Remove the files of a generated tube where no flight began."""
+def _forget_unflown(folder: Path, written: tuple[Path, ...]) -> None:
+    """Remove the files of a tube where no flight began."""
     if not (folder / MANIFEST).exists():
-        for name in TUBE_FILES:
-            (folder / name).unlink(missing_ok=True)
+        for path in written:
+            path.unlink(missing_ok=True)
 
 
 def _fly_recorded(flight: Flight, after: Continuation | None) -> dict[str, Any]:

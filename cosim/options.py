@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,11 +11,16 @@ from typing import Any, Final, TypeVar
 import click
 
 from cosim.named_settings import NamedSettings
+from meshes.errors import MeshError
+from meshes.scale import MeanRadius, parse_scale
 
 SHIPPED_MESH: Final = "industrial.obj"
 SHIPPED_POLICY: Final = "tube_ppo"
 DEFAULT_PHYSICS_DT: Final = 1.0 / 240.0
 DEFAULT_ATTACH_SECONDS: Final = 30.0
+
+Place = int | tuple[float, float, float]
+"""The number of an opening, from 1, or a point in the coordinates of the mesh's file."""
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -46,9 +52,12 @@ class FlightOptions:
     max_steps: int | None = None
     seed: int | None = None
     out: Path | None = None
-    axes: str = "zup"
-    scale: float = 1.0
+    axes: str = "auto"
+    scale: float | MeanRadius | None = None
+    """None for the unit that the file states, or metres."""
     start_end: str = "first"
+    entry: Place | None = None
+    exit: Place | None = None
     realtime: float | None = None
     on_contact: str = "end"
     parameters: tuple[str, ...] = ()
@@ -107,6 +116,55 @@ class TubeType(click.ParamType[TubeChoice]):
         return TubeChoice(level, seed, length)
 
 
+class ScaleType(click.ParamType["float | MeanRadius"]):
+    """Metres in one unit of a file, or radius=METRES."""
+
+    name = "scale"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float | MeanRadius:
+        """Read `0.001` or `radius=1`."""
+        try:
+            return parse_scale(str(value))
+        except MeshError as error:
+            self.fail(str(error), param, ctx)
+
+
+class PlaceType(click.ParamType[Place]):
+    """The number of an opening, or x,y,z."""
+
+    name = "place"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Place:
+        """Read `2` or `0,1.5,-3`."""
+        try:
+            numbers = [float(part) for part in str(value).split(",")]
+            if len(numbers) == 1 and int(str(value)) >= 1:
+                return int(str(value))
+            x, y, z = numbers
+            if not math.isfinite(x * y * z):
+                raise ValueError
+        except ValueError:
+            self.fail(
+                f"expected the number of an opening, or x,y,z in the coordinates of the file; found {value!r}",
+                param, ctx,
+            )  # fmt: skip
+        return (x, y, z)
+
+
+SCALE: Final = click.option("--scale", type=ScaleType(), metavar="F|radius=R",
+                            help="Metres in one unit of the files, or the mean radius to make it so many metres "
+                                 "[default: the unit that the file states, or metres].")  # fmt: skip
+AXES: Final = click.option("--axes", type=click.Choice(["auto", "zup", "yup"]), default="auto", show_default=True,
+                           help="Up axis of the files; auto follows the file or its format.")  # fmt: skip
+ENDS: Final = (
+    click.option("--entry", type=PlaceType(), metavar="N|x,y,z",
+                 help="Where a centreline to be found starts: an opening's number, or in the file's coordinates."),
+    click.option("--exit", type=PlaceType(), metavar="N|x,y,z", help="Where it ends [default: the other opening]."),
+)  # fmt: skip
+
+
 def _positive(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
     """Refuse zero, negative and non-finite values."""
     if value is not None and not 0.0 < value < float("inf"):
@@ -119,11 +177,10 @@ _FLIGHT: Final = (
     click.option("--tube", type=TubeType(), metavar="level=L,seed=N[,length=R]",
                  help="A generated tube: that of `cosim evaluate`."),
     click.option("--centerline", type=click.Path(path_type=Path), metavar="PATH", default=None,
-                 help="Centreline .obj [default: <mesh stem>_centerline.obj beside the mesh]."),
-    click.option("--axes", type=click.Choice(["zup", "yup"]), default="zup", show_default=True,
-                 help="Up axis of the files."),
-    click.option("--scale", type=float, callback=_positive, default=1.0, show_default=True,
-                 help="Metres in one unit of the files."),
+                 help="Centreline .obj [default: <mesh stem>_centerline.obj beside the mesh, else it is found]."),
+    AXES,
+    SCALE,
+    *ENDS,
     click.option("--start-end", type=click.Choice(["first", "last"]), default="first", show_default=True,
                  help="End of the centreline to start from."),
     click.option("--policy", metavar="PATH|pure-pursuit|lidar-rule", default=SHIPPED_POLICY, show_default=True,

@@ -15,9 +15,12 @@ from cosim.errors import RunError
 from cosim.integrity import check_data
 from cosim.launch import Continuation, launch
 from cosim.named_settings import NamedSettings
-from cosim.options import FlightOptions, TubeChoice
+from cosim.options import FlightOptions, Place, TubeChoice
 from cosim.runs import Run, read_run
+from cosim.scene import where_is
 from cosim.verify import find_tube
+from meshes.scale import MeanRadius
+from protocol.plant import TubeReference
 
 
 def replay(
@@ -51,7 +54,7 @@ def replay(
         raise RunError(f"{folder}: {changed[0]}")
     options = replace(options_of(run), policy=policy, lookahead=None, speed=None, out=out)
     if options.tube is None:
-        options = replace(options, mesh=tube.path)
+        options = _same_tube(options, run, tube)
     if options.connect is not None and server is None:
         raise RunError(
             f"{folder}: its physics process was started by hand (--connect {options.connect}); say with --server "
@@ -61,6 +64,20 @@ def replay(
     report = launch(options, as_json=as_json, after=beginning(run, from_step))
     if not as_json:
         click.echo(comparison(run, read_run(Path(report["run_dir"])), from_step))
+
+
+def _same_tube(options: FlightOptions, run: Run, tube: TubeReference) -> FlightOptions:
+    """Options that name the tube as it was resolved, along the centreline that was flown: nothing is found anew."""
+    centreline = where_is(run, run.manifest["mesh"]["centreline"])
+    return replace(
+        options,
+        mesh=tube.path,
+        centerline=centreline,
+        axes=tube.axes,
+        scale=tube.scale,
+        entry=None,
+        exit=None,
+    )
 
 
 def options_of(run: Run) -> FlightOptions:
@@ -80,6 +97,10 @@ def options_of(run: Run) -> FlightOptions:
             known[name] = None if known[name] is None else Path(known[name])
         for name in ("allow_mismatch", "parameters"):
             known[name] = tuple(known[name])
+        for name in ("entry", "exit"):
+            known[name] = _place_of(known[name])
+        if isinstance(known["scale"], dict):
+            known["scale"] = MeanRadius(**known["scale"])
         named = NamedSettings(settings["hard"], _pairs(settings["conditions"]), _pairs(settings["tubes"]))
         return FlightOptions(**known, settings=named, tube=None if tube is None else TubeChoice(**tube))
     except (KeyError, TypeError) as error:
@@ -119,6 +140,13 @@ def _after(run: Run, from_step: int) -> dict[str, str]:
         "mean alignment": f"{float(records['alignment'].mean()):.3f}",
         "reward": f"{float(records['reward'].sum()):.1f}",
     }
+
+
+def _place_of(stored: int | list[float] | None) -> Place | None:
+    if stored is None or isinstance(stored, int):
+        return stored
+    x, y, z = stored
+    return x, y, z
 
 
 def _pairs(values: dict[str, Any]) -> dict[str, Any]:

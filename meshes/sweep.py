@@ -53,13 +53,14 @@ def write_obj(path: Path | str, vertices: Floats, faces: NDArray[np.int32]) -> N
     _write(Path(path), vertices, "f %d %d %d\n", faces)
 
 
-def write_centreline_obj(path: Path | str, points: Floats) -> None:
+def write_centreline_obj(path: Path | str, points: Floats, digits: int = 9) -> None:
     """Writes a centreline (M, 3) as .obj, one `l` element for each of its segments, as Blender does."""
     index = np.arange(len(points))
-    _write(Path(path), points, "l %d %d\n", np.stack([index[:-1], index[1:]], axis=1))
+    _write(Path(path), points, "l %d %d\n", np.stack([index[:-1], index[1:]], axis=1), digits)
 
 
-def _write(path: Path, vertices: Floats, element: str, indices: NDArray[np.integer]) -> None:
-    corners = "v %.9g %.9g %.9g\n" * len(vertices) % tuple(vertices.ravel().tolist())
+def _write(path: Path, vertices: Floats, element: str, indices: NDArray[np.integer], digits: int = 9) -> None:
+    number = f"%.{digits}g"
+    corners = f"v {number} {number} {number}\n" * len(vertices) % tuple(vertices.ravel().tolist())
     elements = element * len(indices) % tuple((indices + 1).ravel().tolist())
     path.write_text(f"o {path.stem}\n{corners}{elements}", encoding="utf-8")

@@ -28,7 +28,7 @@ def refused(done: Done, folder: Path, *words: str) -> None:
     """Status 2, one line that contains the words, nothing on stdout, no run folder."""
     assert done.status == 2, done.stderr
     assert done.stdout == ""
-    sentences = [line for line in done.stderr.splitlines() if not line.startswith(("mesh:", "policy:"))]
+    sentences = [line for line in done.stderr.splitlines() if not line.startswith(("mesh:", "policy:", "session:"))]
     assert len(sentences) == 1 or sentences[0].startswith("Usage"), done.stderr
     for word in words:
         assert word in done.stderr
@@ -62,17 +62,16 @@ def test_a_mesh_that_cannot_be_used(
 @pytest.mark.parametrize(
     ("centreline", "words"),
     [
-        (None, ("tube_centerline.obj",)),
         ("v 0 0 0\nv 5 0 0\nv 9 0 0\nv 5 1 0\nl 1 2\nl 2 3\nl 2 4\n", ("branch",)),
         ("v 0 5 0\nv 9 5 0\nl 1 2\n", ("inside",)),
         ("v 0 0 0\nv 1 0 0\n", ("segment",)),
     ],
-    ids=["none beside the mesh", "branches", "outside", "no segments"],
+    ids=["branches", "outside", "no segments"],
 )
 def test_a_centreline_that_cannot_be_used(
-    fly: Callable[..., Done], tmp_path: Path, centreline: str | None, words: tuple[str, ...]
+    fly: Callable[..., Done], tmp_path: Path, centreline: str, words: tuple[str, ...]
 ) -> None:
-    """A centreline that is missing, branches, or lies outside of the tube is refused."""
+    """A centreline that branches, has no segments, or lies outside of the tube is refused."""
     refused(fly("--mesh", tube(tmp_path, centreline)), tmp_path, *words)
 
 
