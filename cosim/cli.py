@@ -15,7 +15,7 @@ import click
 from cosim import __version__
 from cosim.errors import INTERNAL, PEER, Terminated, exit_status
 from cosim.named_settings import SettingsCommand, take_settings
-from cosim.options import FlightOptions, evaluate_options, flight_options
+from cosim.options import FlightOptions, evaluate_options, flight_options, view_options
 
 EXIT_NO_SUCCESS: Final = 1
 FORMATS: Final = ("csv", "npz", "parquet", "tum", "mcap", "gltf", "usd")
@@ -114,6 +114,25 @@ def report(sources: tuple[Path, ...], out: Path | None) -> None:
     from cosim.report import report as write
 
     click.echo(write(sources, out))
+
+
+@cosim.command(short_help="Show runs or a mesh in 3-D, or write pictures and films of them.")
+@click.argument("sources", nargs=-1, type=click.Path(path_type=Path), metavar="[RUN ...|MESH]")
+@view_options
+def view(sources: tuple[Path, ...], **options: Any) -> None:
+    """Show recorded runs, or a MESH with its centreline and openings, in a window; [default: the shipped mesh].
+
+    The tube is cut open towards the camera. Keys: space plays, arrows step, c changes the camera, q quits.
+
+    \b
+    cosim view runs/2026-...
+    cosim view runs/ppo runs/pure-pursuit --movie race.mp4 --camera follow
+    cosim view tube.stl --screenshot tube.png
+    """
+    from cosim.view import read_options
+    from cosim.view import view as run
+
+    run(read_options(sources, options))
 
 
 @cosim.command(short_help="Check a recorded run, and replay its commands through fresh physics.")

@@ -4,6 +4,7 @@
     ├── OutputError                 2   the run folder cannot be written, or already holds a run
     ├── RunError                    2   a run folder that cannot be read
     ├── PeerCommandError            2   the physics command cannot be started
+    ├── ViewError                   2   nothing can be drawn here
     └── WorkerError                     a worker process failed; 3, or the status of what it failed of
     protocol.errors.ProtocolError   3   the other process or the protocol failed
     ├── protocol.errors.SessionError    2   our own side asked for what cannot be had (no room, name in use)
@@ -40,6 +41,10 @@ class RunError(CosimError):
 
 class PeerCommandError(CosimError):
     """A physics command that cannot be started."""
+
+
+class ViewError(CosimError):
+    """A picture or window that cannot be made here; says what is missing and what to do."""
 
 
 class WorkerError(CosimError):

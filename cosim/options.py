@@ -153,6 +153,24 @@ class PlaceType(click.ParamType[Place]):
         return (x, y, z)
 
 
+class SizeType(click.ParamType[tuple[int, int]]):
+    """Width and height in pixels."""
+
+    name = "size"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int]:
+        """Read `1280x800`."""
+        try:
+            width, height = (int(part) for part in str(value).lower().split("x"))
+            if not (64 <= width <= 8192 and 64 <= height <= 8192):
+                raise ValueError
+        except ValueError:
+            self.fail(f"expected WIDTHxHEIGHT, each from 64 to 8192 pixels, found {value!r}", param, ctx)
+        return width, height
+
+
 SCALE: Final = click.option("--scale", type=ScaleType(), metavar="F|radius=R",
                             help="Metres in one unit of the files, or the mean radius to make it so many metres "
                                  "[default: the unit that the file states, or metres].")  # fmt: skip
@@ -236,6 +254,29 @@ def _levels(ctx: click.Context, param: click.Parameter, value: str | None) -> tu
     return tuple(map(int, levels))
 
 
+_VIEW: Final = (
+    click.option("--screenshot", type=click.Path(path_type=Path), metavar="F.png",
+                 help="Write a picture, without a window."),
+    click.option("--movie", type=click.Path(path_type=Path), metavar="F.mp4|F.gif", help="Write a film of a run."),
+    click.option("--figure", type=click.Path(path_type=Path), metavar="F.png",
+                 help="Write the paper's figure of a mesh: conduit and centreline in Blender and in vedo; vedo "
+                      "draws all of it."),
+    click.option("--step", type=click.IntRange(min=0), metavar="K",
+                 help="Of the picture or the window's beginning [default: the middle; the beginning]."),
+    click.option("--camera", type=click.Choice(["overview", "follow", "inside"]), help="[default: overview]"),
+    click.option("--colour", "--color", "colour", type=click.Choice(["clearance", "reward", "speed"]),
+                 help="Of trajectories [default: clearance; of several runs, each its own]."),
+    click.option("--realtime", type=float, callback=_positive, metavar="FACTOR", default=1.0,
+                 help="Pace of films and of playing; 1 is wall clock [default: 1]."),
+    click.option("--size", type=SizeType(), default="1280x800", metavar="WxH", help="[default: 1280x800]"),
+    click.option("--centerline", type=click.Path(path_type=Path), metavar="PATH",
+                 help="Of a mesh [default: <mesh stem>_centerline.obj beside it, else it is found]."),
+    AXES,
+    SCALE,
+    *ENDS,
+)  # fmt: skip
+
+
 _EVALUATE: Final = (
     click.option("--policy", "policies", multiple=True, metavar="P",
                  help="Checkpoint, pure-pursuit (look-ahead the camera's 3 m; in `cosim launch` 1 m), "
@@ -275,6 +316,11 @@ def flight_options(command: Command) -> Command:
 def evaluate_options(command: Command) -> Command:
     """Give a click command the options of an evaluation, for `cosim.evaluation_plan.read_options`."""
     return _with(_EVALUATE, command)
+
+
+def view_options(command: Command) -> Command:
+    """Give a click command the options of `cosim.view.ViewOptions`."""
+    return _with(_VIEW, command)
 
 
 def _with(options: tuple[Callable[[Command], Command], ...], command: Command) -> Command:

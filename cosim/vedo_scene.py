@@ -1,0 +1,319 @@
+"""The only file that imports vedo: a stage of shapes, seen in a window or drawn to a picture without a display.
+
+It knows no run and no drone. Points are in the world frame (m), colours are "#rrggbb".
+"""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import os
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+import numpy as np
+import vedo
+from numpy.typing import NDArray
+from vtkmodules.vtkCommonCore import vtkLogger
+from vtkmodules.vtkRenderingCore import vtkRenderWindow
+
+from cosim.cameras import Camera
+from cosim.errors import ViewError
+from cosim.film import Image
+from cosim.scene import Surface
+
+Floats = NDArray[np.float64]
+FONT: Final = "Calco"
+INK: Final = "#22303c"
+
+_OSMESA: Final = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
+
+
+class Shape:
+    """One thing on the stage, which can be moved, painted, and hidden."""
+
+    def __init__(self, mesh: Any) -> None:
+        self._mesh = mesh
+
+    def move(self, points: Floats) -> None:
+        """Give its vertices new places; as many as before."""
+        self._mesh.points = points
+
+    def paint(self, colours: Image) -> None:
+        """Colour its vertices, (V, 4) red, green, blue, opacity from 0 to 255."""
+        self._mesh.pointcolors = colours
+
+    def place(self, position: Floats, rotation: Floats) -> None:
+        """Put its own frame there: position (3,), rotation (3, 3) with the frame's axes as columns."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = rotation, position
+        self._mesh.actor.SetUserMatrix(vedo.LinearTransform(matrix).T.GetMatrix())
+
+    def show(self, wanted: bool) -> None:
+        """Show or hide it."""
+        self._mesh.actor.SetVisibility(wanted)
+
+
+class Stage:
+    """What is seen, and from where.
+
+    Args:
+        size: width and height (pixels).
+        offscreen: draw to pictures, without a window or a display.
+        title: of the window.
+        sky: colours of the background, bottom and top.
+
+    Raises:
+        ViewError: nothing can be drawn here; says what is missing.
+    """
+
+    def __init__(
+        self,
+        size: tuple[int, int],
+        *,
+        offscreen: bool,
+        title: str,
+        sky: tuple[str, str],
+    ) -> None:
+        _prepare(offscreen)
+        self.size = size
+        self._plotter = vedo.Plotter(
+            size=size, offscreen=offscreen, title=title, bg=sky[0], bg2=sky[1], interactive=False
+        )
+        self._unit = min(size[1] / 600.0, size[0] / 800.0)
+        """Texts grow with the picture."""
+        self._begun = self._closed = False
+
+    def wall(self, surface: Surface, colour: str, *, cut: bool, ghost: float = 0.1) -> None:
+        """Put up a tube's wall.
+
+        Args:
+            surface: its triangles, wound so that they face outwards where it is cut.
+            colour: of the wall.
+            cut: leave out whatever faces the camera, so that one looks into the tube from everywhere.
+            ghost: opacity of what is left out; of the whole wall where it is not cut.
+        """
+        mesh = vedo.Mesh([surface.vertices, surface.faces], c=colour).clean()
+        # Its winding decides what is left out, and must stay as it is.
+        mesh.compute_normals(feature_angle=50, consistency=False)
+        if cut:
+            ghostly = mesh.clone().backface_culling(True).alpha(ghost).lighting("default")
+            mesh.frontface_culling(True).lighting(ambient=0.5, diffuse=0.55, specular=0.05)
+            self._plotter.add(mesh, ghostly)
+        else:
+            self._plotter.add(mesh.alpha(ghost).lighting(ambient=0.3, diffuse=0.75, specular=0.15))
+
+    def rims(self, surface: Surface, colour: str) -> None:
+        """Draw the open edges of a surface."""
+        mesh = vedo.Mesh([surface.vertices, surface.faces]).clean()
+        self._plotter.add(mesh.boundaries().c(colour).linewidth(2 * self._unit))
+
+    def lines(self, pieces: Sequence[Floats], colour: str, width: float = 2.0, alpha: float = 1.0) -> Shape:
+        """Draw polylines, each (M, 3)."""
+        points = np.concatenate(pieces)
+        ends = np.cumsum([0, *(len(piece) for piece in pieces)])
+        runs = [list(range(a, b)) for a, b in itertools.pairwise(ends.tolist())]
+        mesh = vedo.Mesh([points, [], runs], c=colour, alpha=alpha).linewidth(width * self._unit)
+        return self._add(mesh.lighting("off"))
+
+    def surface(self, surface: Surface, colour: str, *, alpha: float = 1.0, flat: bool = False) -> Shape:
+        """Put up any surface; `flat` leaves out light and shade."""
+        mesh = vedo.Mesh([surface.vertices, surface.faces], c=colour, alpha=alpha)
+        return self._add(mesh.lighting("off") if flat else mesh.compute_normals().lighting("plastic"))
+
+    def scaled_line(
+        self,
+        points: Floats,
+        values: Floats,
+        *,
+        width: float,
+        colours: str,
+        limits: tuple[float, float],
+        title: str,
+    ) -> None:
+        """Draw a polyline (M, 3) coloured by values (M,), with their scale beside it if it has a title."""
+        line = vedo.Line(points, lw=width * self._unit)
+        line.pointdata["value"] = values
+        line.cmap(colours, "value", vmin=limits[0], vmax=limits[1]).lighting("off")
+        self._add(line)
+        if title:
+            line.add_scalarbar(
+                title,
+                pos=((0.9, 0.08), (0.97, 0.5)),
+                font_size=int(14 * self._unit),
+                title_yoffset=int(12 * self._unit),
+                nlabels=5,
+                label_format=":.2f",
+                c=INK,
+            )
+            self._plotter.add(line.scalarbar)
+
+    def dot(self, colour: str, size: float) -> Shape:
+        """Draw a round dot that is as large from everywhere (pixels), to be moved."""
+        return self._add(vedo.Points([(0.0, 0.0, 0.0)], r=size * self._unit, c=colour).lighting("off"))
+
+    def text(self, words: str, place: str, *, size: float = 1.0, colour: str = INK) -> Callable[[str], None]:
+        """Write at a place such as "top-left"; returns what changes the words."""
+        text = vedo.Text2D(words, pos=place, s=size * self._unit, c=colour, font=FONT, bg="white", alpha=0.55)
+        self._plotter.add(text)
+        return text.text  # type: ignore[no-any-return]
+
+    def numbers(self, places: Sequence[Floats], colour: str) -> None:
+        """Write 1, 2, ... at points of the world, each (3,), in front of everything."""
+        anchors = vedo.Points(np.array(places))
+        anchors.pointdata["number"] = np.arange(1, len(places) + 1)
+        anchors.pointdata.select("number")
+        labels = anchors.labels2d(
+            "number", precision=None, c="white", bc=colour, scale=0.9 * self._unit, font=FONT
+        )
+        self._plotter.add(labels)
+
+    def legend(self, entries: Sequence[tuple[str, str]]) -> None:
+        """Name colours at the top right: (name, colour) of each."""
+        longest = max(len(name) for name, _ in entries)
+        swatches = []
+        for name, colour in entries:
+            swatches.append(
+                vedo.Mesh([[(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)]], c=colour).legend(name)
+            )
+        box = vedo.LegendBox(
+            swatches,
+            font=FONT,
+            width=min(0.5, (0.011 * longest + 0.06)),
+            height=0.045 * len(entries),
+            pos="top-right",
+            markers="s",
+            bg="white",
+            alpha=0.6,
+        )
+        self._plotter.add(box)
+
+    def look(self, camera: Camera) -> None:
+        """Look from there."""
+        found = self._plotter.camera
+        found.SetPosition(camera.position)
+        found.SetFocalPoint(camera.focus)
+        found.SetViewUp(camera.up)
+        found.SetViewAngle(camera.angle)
+        self._plotter.renderer.ResetCameraClippingRange()
+        nearest, farthest = found.GetClippingRange()
+        found.SetClippingRange(max(nearest, camera.nearest), farthest)
+
+    def picture(self) -> Image:
+        """Draw, and return what is seen."""
+        self._begin()
+        # The window whose picture is taken is the one that vedo holds for the current one.
+        vedo.set_current_plotter(self._plotter)
+        return np.ascontiguousarray(self._plotter.screenshot(asarray=True)[..., :3])
+
+    def draw(self) -> None:
+        """Draw to the window."""
+        self._begin()
+        self._plotter.render()
+
+    def pump(self) -> bool:
+        """Let the window answer to mouse and keys; whether it is still open."""
+        self._begin()
+        if not self._closed:
+            self._plotter.interactor.ProcessEvents()
+        return not self._closed
+
+    def on_key(self, handler: Callable[[str], None]) -> None:
+        """Call `handler` with the name of every key that is pressed, such as "space", "Left" or "c"."""
+        self._plotter.add_callback(
+            "KeyPress", lambda event: handler(str(event.keypress)), enable_picking=False
+        )
+
+    def slider(self, last: int, handler: Callable[[int], None]) -> Callable[[int], None]:
+        """Put a slider from 0 to `last` below the scene; returns what moves it without calling `handler`."""
+        slider = self._plotter.add_slider(
+            lambda widget, _event: handler(round(widget.value)),
+            0,
+            last,
+            value=0,
+            pos=[(0.28, 0.06), (0.86, 0.06)],
+            show_value=False,
+            c=INK,
+            slider_length=0.012,
+            slider_width=0.022,
+            tube_width=0.004,
+        )
+
+        def move(value: int) -> None:
+            slider.value = value
+
+        return move
+
+    def button(
+        self, words: Sequence[str], place: tuple[float, float], handler: Callable[[], None]
+    ) -> Callable[[int], None]:
+        """Put a button there, in shares of the window; returns what chooses which of its words it shows."""
+        button = self._plotter.add_button(
+            lambda _object, _event: handler(),
+            states=list(words),
+            c=["white"] * len(words),
+            bc=[INK] * len(words),
+            pos=place,
+            size=int(17 * self._unit),
+            font=FONT,
+            bold=False,
+        )
+        return button.status  # type: ignore[no-any-return]
+
+    def close(self) -> None:
+        """Take it down."""
+        self._plotter.close()
+
+    def _add(self, mesh: Any) -> Shape:
+        self._plotter.add(mesh)
+        return Shape(mesh)
+
+    def _begin(self) -> None:
+        if not self._begun:
+            self._plotter.show(resetcam=False, interactive=False)
+            if self._plotter.interactor is not None:
+                # With an observer VTK leaves the end to it.
+                self._plotter.interactor.AddObserver("ExitEvent", self._end)
+            self._begun = True
+
+    def _end(self, _caller: object, _event: str) -> None:
+        self._closed = True
+
+
+def _prepare(offscreen: bool) -> None:
+    """Choose how to draw, and find out whether it works: where nothing does, VTK would take the process down.
+
+    Raises:
+        ViewError: no display for a window, or no library that draws without one.
+    """
+    vedo.settings.default_backend = "vtk"
+    vedo.settings.default_font = FONT
+    vedo.settings.multi_samples = 4
+    vedo.settings.enable_default_keyboard_callbacks = False
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    if sys.platform != "linux":
+        return
+    if offscreen and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+    kind = vtkRenderWindow().GetClassName()
+    if not offscreen and kind != "vtkXOpenGLRenderWindow":
+        display = os.environ.get("DISPLAY")
+        found = f"DISPLAY={display}, which cannot be opened" if display else "none"
+        raise ViewError(
+            f"a window: expected a display, found {found}; without one give --screenshot FILE.png or "
+            "--movie FILE.mp4"
+        )
+    if kind == "vtkOSOpenGLRenderWindow" and not any(map(_loads, _OSMESA)):
+        raise ViewError(
+            "drawing without a display: expected EGL or OSMesa, found neither; "
+            "apt-get install libegl1 libgl1-mesa-dri (or libosmesa6), or run under xvfb-run"
+        )
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
