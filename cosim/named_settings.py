@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from cosim.screens import Command, shows_all
+
 if TYPE_CHECKING:  # the tables are imported when a command needs them: `cosim --help` starts without numba
     from agent_client.conditions import Condition, Conditions, Range
     from agent_client.tubes import TubeRecipe
@@ -188,7 +190,7 @@ def settings_options() -> tuple[click.Option, ...]:
     return tuple(options)
 
 
-class SettingsCommand(click.Command):
+class SettingsCommand(Command):
     """A command that takes the named settings too."""
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
@@ -198,11 +200,19 @@ class SettingsCommand(click.Command):
             ["--list-settings"], is_flag=True, is_eager=True, expose_value=False, callback=_list_settings,
             help="Say what each named setting means.",
         )  # fmt: skip
-        *declared, help_option = super().get_params(ctx)
-        return [*declared, hard, listing, *settings_options(), help_option]
+        *declared, more, help_option = super().get_params(ctx)
+        return [*declared, hard, listing, *settings_options(), more, help_option]
+
+    def leaves_out(self, declared: list[click.Parameter]) -> bool:
+        """The named settings are listed by --help-all alone."""
+        return True
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Name the settings with unit and default."""
+        """Name the settings, with unit and default where all is wanted."""
+        if not shows_all(ctx):
+            some = "--gain, --lidar-noise, --shape, ... (see --list-settings)"
+            formatter.write(f"\nNamed settings: {some}\n")
+            return
         text = " ".join(f"{name}\u00a0[{default}]" for name, default in _defaults())
         lines = textwrap.wrap(text, formatter.width - 2, break_on_hyphens=False)
         formatter.write("\nNamed settings, each a value, or a range low:high that every flight draws from:\n")

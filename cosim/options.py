@@ -11,6 +11,7 @@ from typing import Any, Final, TypeVar
 import click
 
 from cosim.named_settings import NamedSettings
+from cosim.screens import option, rare
 from meshes.errors import MeshError
 from meshes.scale import MeanRadius, parse_scale
 
@@ -171,15 +172,15 @@ class SizeType(click.ParamType[tuple[int, int]]):
         return width, height
 
 
-SCALE: Final = click.option("--scale", type=ScaleType(), metavar="F|radius=R",
+SCALE: Final = option("--scale", type=ScaleType(), metavar="F|radius=R",
                             help="Metres in one unit of the files, or the mean radius to make it so many metres "
                                  "[default: the unit that the file states, or metres].")  # fmt: skip
-AXES: Final = click.option("--axes", type=click.Choice(["auto", "zup", "yup"]), default="auto", show_default=True,
+AXES: Final = rare("--axes", type=click.Choice(["auto", "zup", "yup"]), default="auto", show_default=True,
                            help="Up axis of the files; auto follows the file or its format.")  # fmt: skip
 ENDS: Final = (
-    click.option("--entry", type=PlaceType(), metavar="N|x,y,z",
+    rare("--entry", type=PlaceType(), metavar="N|x,y,z",
                  help="Where a centreline to be found starts: an opening's number, or in the file's coordinates."),
-    click.option("--exit", type=PlaceType(), metavar="N|x,y,z", help="Where it ends [default: the other opening]."),
+    rare("--exit", type=PlaceType(), metavar="N|x,y,z", help="Where it ends [default: the other opening]."),
 )  # fmt: skip
 
 
@@ -191,44 +192,44 @@ def _positive(ctx: click.Context, param: click.Parameter, value: float | None) -
 
 
 _FLIGHT: Final = (
-    click.option("--mesh", metavar="PATH", help=f"Tube mesh [default: {SHIPPED_MESH}]."),
-    click.option("--tube", type=TubeType(), metavar="level=L,seed=N[,length=R]",
+    option("--mesh", metavar="PATH", help=f"Tube mesh [default: {SHIPPED_MESH}]."),
+    option("--tube", type=TubeType(), metavar="level=L,seed=N[,length=R]",
                  help="A generated tube: that of `cosim evaluate`."),
-    click.option("--centerline", type=click.Path(path_type=Path), metavar="PATH", default=None,
+    rare("--centerline", type=click.Path(path_type=Path), metavar="PATH", default=None,
                  help="Centreline .obj [default: <mesh stem>_centerline.obj beside the mesh, else it is found]."),
     AXES,
     SCALE,
     *ENDS,
-    click.option("--start-end", type=click.Choice(["first", "last"]), default="first", show_default=True,
+    rare("--start-end", type=click.Choice(["first", "last"]), default="first", show_default=True,
                  help="End of the centreline to start from."),
-    click.option("--policy", metavar="PATH|pure-pursuit|lidar-rule", default=SHIPPED_POLICY, show_default=True,
+    option("--policy", metavar="PATH|pure-pursuit|lidar-rule", default=SHIPPED_POLICY, show_default=True,
                  help="Checkpoint, or a baseline; Pure Pursuit knows the centreline."),
-    click.option("--lookahead", type=float, callback=_positive, metavar="M",
+    rare("--lookahead", type=float, callback=_positive, metavar="M",
                  help="Of Pure Pursuit (m) [default: 1; `cosim evaluate` takes the camera's 3]."),
-    click.option("--speed", type=float, callback=_positive, metavar="V",
+    rare("--speed", type=float, callback=_positive, metavar="V",
                  help="Of Pure Pursuit (m/s) [default: 2]."),
-    click.option("--dt", type=Fraction(), help="Control step (s) [default: the checkpoint's]."),
-    click.option("--physics-dt", type=Fraction(), default=DEFAULT_PHYSICS_DT, show_default=False,
+    rare("--dt", type=Fraction(), help="Control step (s) [default: the checkpoint's]."),
+    rare("--physics-dt", type=Fraction(), default=DEFAULT_PHYSICS_DT, show_default=False,
                  help="Inner step (s); dt must be a whole multiple [default: 1/240]."),
-    click.option("--allow-mismatch", type=click.Choice(["dt"]), multiple=True,
+    rare("--allow-mismatch", type=click.Choice(["dt"]), multiple=True,
                  help="Fly although this differs from the checkpoint."),
-    click.option("--max-steps", type=click.IntRange(min=1, max=10**9),
+    rare("--max-steps", type=click.IntRange(min=1, max=10**9),
                  help="Step limit [default: 1.5 length / (slowest speed x dt)]."),
-    click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=None, show_default=False,
+    option("--seed", type=click.IntRange(0, 2**63 - 1), default=None, show_default=False,
                  help="Of start, conditions, noise and gusts [default: 0, or the tube's]."),
-    click.option("--on-contact", type=click.Choice(["end", "continue"]), default="end", show_default=True,
+    rare("--on-contact", type=click.Choice(["end", "continue"]), default="end", show_default=True,
                  help="End at the first contact, or count on."),
-    click.option("--parameter", "parameters", multiple=True, metavar="NAME=VALUE",
+    option("--parameter", "parameters", multiple=True, metavar="NAME=VALUE",
                  help="Plant parameter, e.g. force_gain=2."),
-    click.option("--realtime", type=float, callback=_positive, metavar="FACTOR",
+    option("--realtime", type=float, callback=_positive, metavar="FACTOR",
                  help="Pace; 1 is wall clock [default: as fast as possible]."),
-    click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [default: new]."),
-    click.option("--server", metavar="COMMAND", help="Start this physics peer as COMMAND RENDEZVOUS."),
-    click.option("--connect", metavar="RENDEZVOUS", help="Wait for a peer that you start; never kill it."),
-    click.option("--session", metavar="NAME", help="Name of the session [default: a new one]."),
-    click.option("--transport", type=click.Choice(["shm", "file"]), default="shm", show_default=True,
+    option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [default: new]."),
+    option("--server", metavar="COMMAND", help="Start this physics peer as COMMAND RENDEZVOUS."),
+    option("--connect", metavar="RENDEZVOUS", help="Wait for a peer that you start; never kill it."),
+    rare("--session", metavar="NAME", help="Name of the session [default: a new one]."),
+    rare("--transport", type=click.Choice(["shm", "file"]), default="shm", show_default=True,
                  help="Shared memory, or mapped files."),
-    click.option("--attach-timeout", type=float, callback=_positive, default=DEFAULT_ATTACH_SECONDS,
+    rare("--attach-timeout", type=float, callback=_positive, default=DEFAULT_ATTACH_SECONDS,
                  metavar="S", help="Patience for the peer's attach (s)."),
 )  # fmt: skip
 
@@ -255,21 +256,21 @@ def _levels(ctx: click.Context, param: click.Parameter, value: str | None) -> tu
 
 
 _VIEW: Final = (
-    click.option("--screenshot", type=click.Path(path_type=Path), metavar="F.png",
+    option("--screenshot", type=click.Path(path_type=Path), metavar="F.png",
                  help="Write a picture, without a window."),
-    click.option("--movie", type=click.Path(path_type=Path), metavar="F.mp4|F.gif", help="Write a film of a run."),
-    click.option("--figure", type=click.Path(path_type=Path), metavar="F.png",
+    option("--movie", type=click.Path(path_type=Path), metavar="F.mp4|F.gif", help="Write a film of a run."),
+    option("--figure", type=click.Path(path_type=Path), metavar="F.png",
                  help="Write the paper's figure of a mesh: conduit and centreline in Blender and in vedo; vedo "
                       "draws all of it."),
-    click.option("--step", type=click.IntRange(min=0), metavar="K",
+    option("--step", type=click.IntRange(min=0), metavar="K",
                  help="Of the picture or the window's beginning [default: the middle; the beginning]."),
-    click.option("--camera", type=click.Choice(["overview", "follow", "inside"]), help="[default: overview]"),
-    click.option("--colour", "--color", "colour", type=click.Choice(["clearance", "reward", "speed"]),
+    option("--camera", type=click.Choice(["overview", "follow", "inside"]), help="[default: overview]"),
+    option("--colour", "--color", "colour", type=click.Choice(["clearance", "reward", "speed"]),
                  help="Of trajectories [default: clearance; of several runs, each its own]."),
-    click.option("--realtime", type=float, callback=_positive, metavar="FACTOR", default=1.0,
+    option("--realtime", type=float, callback=_positive, metavar="FACTOR", default=1.0,
                  help="Pace of films and of playing; 1 is wall clock [default: 1]."),
-    click.option("--size", type=SizeType(), default="1280x800", metavar="WxH", help="[default: 1280x800]"),
-    click.option("--centerline", type=click.Path(path_type=Path), metavar="PATH",
+    option("--size", type=SizeType(), default="1280x800", metavar="WxH", help="[default: 1280x800]"),
+    rare("--centerline", type=click.Path(path_type=Path), metavar="PATH",
                  help="Of a mesh [default: <mesh stem>_centerline.obj beside it, else it is found]."),
     AXES,
     SCALE,
@@ -278,32 +279,32 @@ _VIEW: Final = (
 
 
 _EVALUATE: Final = (
-    click.option("--policy", "policies", multiple=True, metavar="P",
+    option("--policy", "policies", multiple=True, metavar="P",
                  help="Checkpoint, pure-pursuit (look-ahead the camera's 3 m; in `cosim launch` 1 m), "
                       "pure-pursuit-tuned or lidar-rule; repeatable [default: all three and tube_ppo]."),
-    click.option("--levels", callback=_levels, metavar="L,L,...",
+    option("--levels", callback=_levels, metavar="L,L,...",
                  help="Levels of the curriculum [default: 0,1,2; 2 for a map]."),
-    click.option("--episodes", type=click.IntRange(1, 1_000_000), metavar="N",
+    option("--episodes", type=click.IntRange(1, 1_000_000), metavar="N",
                  help="Tubes a level [default: 100; 40 a cell of a map]."),
-    click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True,
+    option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True,
                  help="Of tubes, starts and conditions; training sees none of them."),
-    click.option("--dynamics", type=click.Choice(["kinematic", "rigid-body"]),
+    option("--dynamics", type=click.Choice(["kinematic", "rigid-body"]),
                  help="World [default: kinematic]."),
-    click.option("--engine", type=click.Choice(["bullet", "reference"]),
+    option("--engine", type=click.Choice(["bullet", "reference"]),
                  help="Of rigid bodies: a PyBullet server, or in process [default: bullet]."),
-    click.option("--tuning-episodes", type=click.IntRange(5, 100_000), metavar="N",
+    rare("--tuning-episodes", type=click.IntRange(5, 100_000), metavar="N",
                  help="Tubes that tune Pure Pursuit [default: 100; 40 a cell of a map]."),
-    click.option("--sweep", metavar="NAME=V1,V2,...", help="Evaluate for each value of one named setting."),
-    click.option("--map", "draw_map", is_flag=True,
+    option("--sweep", metavar="NAME=V1,V2,...", help="Evaluate for each value of one named setting."),
+    option("--map", "draw_map", is_flag=True,
                  help="Draw success over gain and compensation in place of the table [--dynamics rigid-body, "
                       "--engine reference]."),
-    click.option("--map-gains", callback=_numbers, metavar="G,G,...",
+    rare("--map-gains", callback=_numbers, metavar="G,G,...",
                  help="Columns of the map (1/s) [default: 1,1.5,2,3,4,6,8]."),
-    click.option("--map-compensations", callback=_numbers, metavar="C,C,...",
+    rare("--map-compensations", callback=_numbers, metavar="C,C,...",
                  help="Rows of the map (weight) [default: 0.7,0.8,0.9,1,1.1]."),
-    click.option("--workers", type=click.IntRange(1, 512), metavar="N",
+    option("--workers", type=click.IntRange(1, 512), metavar="N",
                  help="Processes that fly; results do not depend on it [default: the cores]."),
-    click.option("--out", type=click.Path(path_type=Path), metavar="DIR",
+    option("--out", type=click.Path(path_type=Path), metavar="DIR",
                  help="Write results.json with every episode, and the map."),
 )  # fmt: skip
 
@@ -324,6 +325,6 @@ def view_options(command: Command) -> Command:
 
 
 def _with(options: tuple[Callable[[Command], Command], ...], command: Command) -> Command:
-    for option in reversed(options):
-        command = option(command)
+    for declare in reversed(options):
+        command = declare(command)
     return command

@@ -2,23 +2,78 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
-from flights import run_cosim
+from click.testing import CliRunner
+from flights import DEADLINE, command, environment, run_cosim, run_here
+
+from cosim import __version__
+from cosim.cli import cosim
 
 ROUND_TRIPS = {"shm_two_cores", "shm_one_core", "pipe", "udp", "udp_one_core"}
 QUANTILES = {"p50_us", "p99_us", "p999_us"}
 PHASES = {"wait", "physics", "rays", "features", "policy", "recording", "other"}
 
 
-@pytest.mark.parametrize("command", ["launch", "train", "figures", "export", "bench", "conformance"])
-def test_help_says_how_to_call_a_command(command: str, tmp_path: Path) -> None:
-    """Every command has a page of help that fits a screen's width."""
-    done = run_cosim(command, "--help", cwd=tmp_path)
+@pytest.mark.parametrize("name", ["", *cosim.commands])
+def test_help_fits_on_a_screen(name: str) -> None:
+    """Every command's help fits on 80 columns and 40 lines and shows an example; --help-all may be longer."""
+    done = CliRunner().invoke(cosim, [*name.split(), "--help"], prog_name="cosim", terminal_width=80)
+    assert done.exit_code == 0
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith(f"Usage: cosim {name}".strip())
+    assert len(lines) <= 40
+    assert max(map(len, lines)) <= 88  # an example may be a little wider
+    assert any(line.strip().startswith(("cosim", "eval")) and name in line for line in lines[1:])
+
+
+def test_help_all_names_what_help_leaves_out() -> None:
+    """The rare options and the named settings appear, and nothing that --help shows is lost."""
+    short, long = (
+        CliRunner().invoke(cosim, ["launch", option]).stdout for option in ("--help", "--help-all")
+    )
+    assert "--physics-dt" not in short
+    assert "--physics-dt" in long
+    assert "--lidar-noise [0 m]" in long
+    for line in short.splitlines():
+        if line.strip().startswith("--"):
+            assert line.split()[0] in long
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_shells_complete_commands(shell: str, tmp_path: Path) -> None:
+    """The script asks the program itself, which answers with the commands that begin so."""
+    done = run_here("completion", shell)
     assert done.status == 0
-    assert done.stdout.startswith("Usage:")
-    assert max(map(len, done.stdout.splitlines())) <= 110
+    assert "_COSIM_COMPLETE" in done.stdout
+    asked = {"_COSIM_COMPLETE": f"{shell}_complete", "COMP_WORDS": "cosim exp"}
+    asked["COMP_CWORD"] = "exp" if shell == "fish" else "1"
+    answer = subprocess.run(
+        command(), check=False, capture_output=True, text=True, cwd=tmp_path, timeout=DEADLINE,
+        env=environment() | asked,
+    )  # fmt: skip
+    assert "export" in answer.stdout
+    assert "launch" not in answer.stdout
+
+
+def test_the_version_is_told() -> None:
+    """`cosim --version` names program and version."""
+    done = run_here("--version")
+    assert (done.status, done.stdout.strip()) == (0, f"cosim, version {__version__}")
+
+
+def test_help_waits_for_no_heavy_import(tmp_path: Path) -> None:
+    """`cosim --help` loads neither numpy nor anything that takes as long."""
+    heavy = "{'numpy', 'numba', 'rich', 'vedo'}"
+    code = f"import sys; from cosim.cli import cosim; print(sorted({heavy} & set(sys.modules)))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=tmp_path,
+        timeout=DEADLINE, env=environment(),
+    )  # fmt: skip
+    assert done.stdout.strip() == "[]"
 
 
 def test_an_unknown_command_is_bad_usage(tmp_path: Path) -> None:

@@ -1,0 +1,163 @@
+"""Commands about sessions and this machine: `watch`, `conformance`, `doctor`, `bench`, `completion`.
+
+Each parses its options and calls the module of its name, which is imported when the command runs.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any, Final
+
+import click
+
+from cosim.errors import PEER
+from cosim.screens import EXIT_FAILED_CHECK, command, json_option, option
+
+PROGRAM: Final = "cosim"
+
+
+@command(short_help="Show the live state of a running session.")
+@click.argument("session", required=False)
+@option(
+    "--interval",
+    type=click.FloatRange(min=0.01),
+    metavar="S",
+    help="Between two reports [default: 0.1 on a terminal, else 1].",
+)
+@option("--wait", type=click.FloatRange(min=0.0), default=0.0, metavar="S", help="For a session to come.")
+@option("--once", is_flag=True, help="One report, then the end.")
+@option("--json", "as_json", is_flag=True, help="One JSON object a line.")
+def watch(as_json: bool, **options: Any) -> None:
+    """Show the live state of SESSION (a name, shm:NAME or file:/path/stem), or of the only one that runs.
+
+    Reads shared memory and writes nothing. Ends with the session and says why: 0 after its goodbye, else 3.
+    Ctrl-C ends the watching alone.
+
+    \b
+    cosim launch --session mine --realtime 1 &
+    cosim watch mine --wait 10
+    """
+    from cosim.watch import WatchOptions
+    from cosim.watch import watch as run
+
+    if not run(WatchOptions(**options), as_json=as_json):
+        sys.exit(PEER)
+
+
+@command(short_help="Prove a physics side or an agent against the protocol.")
+@option(
+    "--server",
+    metavar="COMMAND",
+    help="Physics side, started as COMMAND RENDEZVOUS for every rule; {} in COMMAND stands for RENDEZVOUS.",
+)
+@option("--agent", metavar="COMMAND", help="Agent, started likewise.")
+@option(
+    "--transport",
+    type=click.Choice(["shm", "file"]),
+    default="shm",
+    show_default=True,
+    help="Of the segments.",
+)
+@option("--level", "levels", metavar="A,B,...", help="core, robustness, lanes, performance [default: all].")
+@option("--rule", "names", metavar="NAME", multiple=True, help="This rule alone; may be repeated.")
+@option(
+    "--timeout",
+    type=click.FloatRange(min=0.1, max=3600.0),
+    metavar="SECONDS",
+    default=10.0,
+    show_default=True,
+    help="To start or to answer.",
+)
+@option("--junit", type=click.Path(path_type=Path), metavar="FILE", help="Write JUnit XML as well.")
+@option("--list", "as_list", is_flag=True, help="Name the rules and run none.")
+@json_option
+def conformance(as_list: bool, as_json: bool, **options: Any) -> None:
+    """Prove any program against the rules of the protocol, which protocol/README.md specifies.
+
+    Exit status 0 if every required rule holds, else 1. A rule is skipped where the program says that it cannot do
+    what the rule is about.
+
+    \b
+    cosim conformance --server "python -m physics_server"
+    cosim conformance --server ./server --transport file --junit report.xml
+    cosim conformance --agent "python -m protocol.conformance.toy_agent" --json
+    cosim conformance --agent "cosim launch --max-steps 30 --connect" --level core
+    """
+    from cosim.conformance import ConformanceOptions
+    from cosim.conformance import conformance as run
+
+    if not run(ConformanceOptions(**options), as_json=as_json, as_list=as_list):
+        sys.exit(EXIT_FAILED_CHECK)
+
+
+@command(short_help="Check this machine, and what dead sessions left on it.")
+@option(
+    "--clean", is_flag=True, help="Remove segments of sessions proved dead, and forgotten scratch folders."
+)
+@json_option
+def doctor(clean: bool, as_json: bool) -> None:
+    """Look at Python, libraries, shared memory, leftovers, cores, clock and optional programs, with what to do.
+
+    Exit status 1 where something failed; warnings are about what is optional.
+
+    \b
+    cosim doctor --clean
+    """
+    from cosim.doctor import doctor as run
+
+    if not run(clean=clean, as_json=as_json):
+        sys.exit(EXIT_FAILED_CHECK)
+
+
+@command(short_help="Measure round trips, control loop, start-up or training.")
+@json_option
+@option("--quick", is_flag=True, help="Fewer samples: a look, not a measurement.")
+@option("--training", is_flag=True, help="The speed of training instead: environment, PPO, past the paper.")
+@option("--protocol", is_flag=True, help="The protocol instead: against the field, the floor, idle, lanes.")
+@option(
+    "--png", type=click.Path(path_type=Path), metavar="FILE", help="With --protocol: draw all round trips."
+)
+@option("--only", metavar="A,B,...", help="With --protocol: these ways alone [default: all].")
+def bench(
+    as_json: bool, quick: bool, training: bool, protocol: bool, png: Path | None, only: str | None
+) -> None:
+    """Measure the protocol's round trip, the whole control loop and the start-up, side by side in one run.
+
+    \b
+    cosim bench --quick
+    cosim bench --protocol --png round_trips.png     against UDP, Pipe, ZeroMQ, gRPC, iceoryx2, PyBullet, C
+    """
+    if training and protocol:
+        raise click.UsageError("--training and --protocol: expected one of them, found both")
+    if not protocol and (png is not None or only is not None):
+        raise click.UsageError(
+            f"--{'png' if png is not None else 'only'} is an option of --protocol, which is not given"
+        )
+    if protocol:
+        from cosim.bench_protocol import bench_protocol
+
+        names = tuple(name.strip() for name in only.split(",")) if only is not None else ()
+        bench_protocol(as_json=as_json, quick=quick, png=png, only=names)
+        return
+    from cosim.bench import bench as run
+
+    run(as_json=as_json, quick=quick, training=training)
+
+
+@command(short_help="Print what makes a shell complete cosim's commands.")
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
+@click.pass_context
+def completion(ctx: click.Context, shell: str) -> None:
+    """Print the script that makes SHELL complete commands, options and their values.
+
+    \b
+    eval "$(cosim completion bash)"                                  # in ~/.bashrc
+    eval "$(cosim completion zsh)"                                   # in ~/.zshrc
+    cosim completion fish > ~/.config/fish/completions/cosim.fish
+    """
+    from click.shell_completion import get_completion_class
+
+    kind = get_completion_class(shell)
+    assert kind is not None  # click has all three
+    click.echo(kind(ctx.find_root().command, {}, PROGRAM, f"_{PROGRAM.upper()}_COMPLETE").source())

@@ -1,0 +1,101 @@
+"""Commands about runs and meshes: `inspect`, `view`, `report`, `export`, `verify`.
+
+Each parses its options and calls the module of its name, which is imported when the command runs.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any, Final
+
+import click
+
+from cosim.options import view_options
+from cosim.screens import EXIT_NO_SUCCESS, command, json_option, option
+
+FORMATS: Final = ("csv", "npz", "parquet", "tum", "mcap", "gltf", "usd")
+"""Of `cosim.export`, whose imports a command's help does not wait for."""
+
+
+@command(short_help="Show runs or a mesh in 3-D; write pictures and films.")
+@click.argument("sources", nargs=-1, type=click.Path(path_type=Path), metavar="[RUN ...|MESH]")
+@view_options
+def view(sources: tuple[Path, ...], **options: Any) -> None:
+    """Show recorded runs, or a MESH with its centreline and openings, in a window; [default: the shipped mesh].
+
+    The tube is cut open towards the camera. Keys: space plays, arrows step, c changes the camera, q quits.
+
+    \b
+    cosim view runs/2026-...
+    cosim view runs/ppo runs/pure-pursuit --movie race.mp4 --camera follow
+    cosim view tube.stl --screenshot tube.png
+    """
+    from cosim.view import read_options
+    from cosim.view import view as run
+
+    run(read_options(sources, options))
+
+
+@command(short_help="Write one HTML page of runs and evaluations.")
+@click.argument("sources", type=click.Path(path_type=Path), nargs=-1, required=True, metavar="RUN...")
+@option(
+    "--out", type=click.Path(path_type=Path), metavar="FILE.html", help="Page [default: RUN/report.html]."
+)
+def report(sources: tuple[Path, ...], out: Path | None) -> None:
+    """Write one HTML page with replay in 3-D, plots, timings, settings and hashes; it opens from disk.
+
+    RUN is a run folder, or the results.json of `cosim evaluate --out`. Several runs are overlaid; an evaluation's
+    failures are linked to those of their runs that are given.
+
+    \b
+    cosim report runs/2026-...
+    cosim report runs/ppo runs/pure-pursuit --out comparison.html
+    """
+    from cosim.report import report as write
+
+    click.echo(write(sources, out))
+
+
+@command(short_help="Write a recorded run in another format.")
+@click.argument("run", type=click.Path(path_type=Path))
+@option("--format", "kind", type=click.Choice(FORMATS), required=True)
+@option("--output", "-o", type=click.Path(path_type=Path), help="File [default: RUN/steps.<format>].")
+def export(run: Path, kind: str, output: Path | None) -> None:
+    """Write a recorded run in another format, from its folder alone.
+
+    \b
+    csv, npz, parquet  every number of every step, with units and frames
+    tum                trajectory for `evo` and SLAM benchmarks
+    mcap               poses, scans, commands and state for Foxglove
+    gltf, usd          animated scene for Blender, Unity and web viewers
+
+    \b
+    cosim export runs/2026-... --format parquet
+    """
+    from cosim.export import export as write
+
+    path, note = write(run, kind, output)
+    if note:
+        click.echo(note, err=True)
+    click.echo(path)
+
+
+@command(short_help="Check a run, and replay its commands through fresh physics.")
+@click.argument("run", type=click.Path(path_type=Path))
+@option("--mesh", type=click.Path(path_type=Path), metavar="PATH", help="Where its tube is now.")
+@option("--server", metavar="COMMAND", help="Physics process, the rendezvous appended [default: the run's].")
+@json_option
+def verify(run: Path, mesh: Path | None, server: str | None, as_json: bool) -> None:
+    """Check that a run is whole, and that a fresh physics process makes the same poses of its commands, bit for bit.
+
+    Exits 1 and names step and quantity where the data, the mesh or the policy were changed or the poses differ.
+    Versions of software that differ are named, and fail only by what they do to the poses.
+
+    \b
+    cosim verify runs/2026-...
+    """
+    from cosim.verify import verify as run_verification
+
+    if not run_verification(run, mesh=mesh, server=server, as_json=as_json):
+        sys.exit(EXIT_NO_SUCCESS)

@@ -1,0 +1,70 @@
+"""Help that fits on a screen: commands show what is often needed, and all the rest with --help-all."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, Final
+
+import click
+
+EXIT_NO_SUCCESS: Final = 1
+"""Of a command that was asked whether something succeeds, where it did not."""
+EXIT_FAILED_CHECK: Final = 1
+"""Of a command that checks something, where it is not as it must be."""
+
+_ALL: Final = "cosim.help_all"
+
+
+class Option(click.Option):
+    """An option whose bounds are said in its help or not at all: a range of 19 digits fills a line."""
+
+    def get_help_extra(self, ctx: click.Context) -> Any:
+        """What is said behind the help, without the range of numbers."""
+        extra = super().get_help_extra(ctx)
+        extra.pop("range", None)
+        return extra
+
+
+class Rare(Option):
+    """An option that only --help-all shows."""
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """The line of help, if all of them are wanted."""
+        return super().get_help_record(ctx) if ctx.meta.get(_ALL) else None
+
+
+class Command(click.Command):
+    """A command with --help-all where it has options that --help leaves out."""
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """The declared options, then the two helps."""
+        *declared, help_option = super().get_params(ctx)
+        if not self.leaves_out(declared):
+            return [*declared, help_option]
+        more = click.Option(
+            ["--help-all"], is_flag=True, is_eager=True, expose_value=False, callback=_help_all,
+            help="Show all options.",
+        )  # fmt: skip
+        return [*declared, more, help_option]
+
+    def leaves_out(self, declared: list[click.Parameter]) -> bool:
+        """Whether --help does not show everything."""
+        return any(isinstance(param, Rare) for param in declared)
+
+
+def shows_all(ctx: click.Context) -> bool:
+    """Whether --help-all was asked for."""
+    return bool(ctx.meta.get(_ALL))
+
+
+def _help_all(ctx: click.Context, _param: click.Parameter, wanted: bool) -> None:
+    if wanted:
+        ctx.meta[_ALL] = True
+        click.echo(ctx.get_help(), color=ctx.color)
+        ctx.exit()
+
+
+command = partial(click.command, cls=Command)
+option = partial(click.option, cls=Option)
+rare = partial(click.option, cls=Rare)
+json_option = option("--json", "as_json", is_flag=True, help="One JSON object on stdout, nothing else.")
