@@ -36,6 +36,14 @@ class Rings:
         return hits
 
     @property
+    def mean(self) -> Floats:
+        """Mean of the distances that meet a wall (m), (M,); NaN where none does."""
+        met = np.isfinite(self.distances)
+        total: Floats = np.where(met, self.distances, 0.0).sum(axis=1)
+        with np.errstate(invalid="ignore"):
+            return total / met.sum(axis=1)
+
+    @property
     def directions(self) -> Floats:
         """Unit vectors of all rays (M, RING, 3)."""
         return ring_directions(self.normals, self.binormals)
@@ -58,19 +66,21 @@ def measure_rings(scene: RayScene, points: Floats, tangents: Floats) -> Rings:
     return Rings(normals, binormals, distances.reshape(-1, RING))
 
 
-def close_sideways(distances: Floats, step: float, radius: float) -> Floats:
+def close_sideways(distances: Floats, step: float) -> Floats:
     """Distances (M, RING) with side branches and holes closed, all finite.
 
     A ray that is much longer than rays of the same angle nearby, or endless, takes the length at which it would
-    no longer stand out: their median over `WINDOW` radii (m) ahead and behind; rings stand `step` (m) apart.
+    no longer stand out: their median over `WINDOW` radii ahead and behind. Rings stand `step` radii apart.
     """
-    reach = max(round(WINDOW * radius / max(step, 1e-12)), 1)
+    reach = max(round(WINDOW / step), 1)
     padded = np.pad(distances, ((reach, reach), (0, 0)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=0)
-    # Every fourth row of the window is enough for a median.
+    # A dozen rows of the window are enough for a median.
     typical = np.median(windows[:, :, :: max(reach // 6, 1)], axis=2)
-    overall = np.median(distances, axis=1, keepdims=True)
-    typical = np.where(np.isfinite(typical), typical, np.where(np.isfinite(overall), overall, radius))
+    in_ring = np.median(distances, axis=1, keepdims=True)
+    met = distances[np.isfinite(distances)]
+    anywhere = np.median(met) if len(met) else 0.0
+    typical = np.where(np.isfinite(typical), typical, np.where(np.isfinite(in_ring), in_ring, anywhere))
     closed: Floats = np.where(distances > SIDEWAYS * typical, typical, distances)
     return closed
 
@@ -78,8 +88,8 @@ def close_sideways(distances: Floats, step: float, radius: float) -> Floats:
 def offsets_of_centres(rings: Rings, distances: Floats) -> Floats:
     """How far (m), (M, 3), the centre of each section lies from where its ring stands, to first order.
 
-    The centre is where the wall distance has no first harmonic over the angle: for a round, elliptic or lobed
-    section that is the axis it was drawn around. A ring that stands off it by d sees -d cos(angle) more.
+    The centre is where the wall distance (M, RING) has no first harmonic over the angle: for a round, elliptic or
+    lobed section that is the axis it was drawn around. A ring that stands off it by d sees -d cos(angle) more.
     """
     first: Floats = 2.0 * (distances[:, :, None] * rings.directions).mean(axis=1)
     return first
@@ -97,5 +107,5 @@ def mean_radius(scene: RayScene, axis: Floats, tangents: Floats) -> float:
     """Mean wall distance (m) over the sections of an evenly sampled axis (M, 3), side branches closed."""
     rings = measure_rings(scene, axis, tangents)
     met = rings.distances[np.isfinite(rings.distances)]
-    step = float(np.linalg.norm(axis[1] - axis[0]))
-    return float(close_sideways(rings.distances, step, float(np.median(met))).mean())
+    step = float(np.linalg.norm(axis[1] - axis[0]) / np.median(met))
+    return float(close_sideways(rings.distances, step).mean())

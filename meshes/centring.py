@@ -1,0 +1,175 @@
+"""A rough path inside of a tube made its centreline, and prolonged to the tube's ends."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from scipy.signal import savgol_filter  # type: ignore[import-untyped]
+
+from meshes.embree import RayScene
+from meshes.geometry import Floats
+from meshes.sections import (
+    RING,
+    SIDEWAYS,
+    close_sideways,
+    measure_rings,
+    offsets_of_centres,
+    ring_directions,
+)
+from meshes.swept import unit_tangents
+
+STEP: Final = 0.2
+"""Distance between points, over the local radius."""
+GAIN: Final = 0.8
+"""Share of the way to the centre that a point is moved at a time."""
+ROUNDS: Final = 40
+"""Times that points are moved at most: 4 for a round section, and the more the flatter it is."""
+SETTLED: Final = 0.003
+"""Largest move of the last round, over the radius."""
+SMOOTHING: Final = 0.75
+"""A cubic is laid through the points within so many radii ahead and behind."""
+TANGENT: Final = 1.2
+"""The same for tangents: a section that turned with every move of its point would never come to rest."""
+FIRST_SMOOTHING: Final = 2.0
+"""The same for the rough path."""
+BLIND: Final = 1.0
+"""A rough path ends so many radii before a cap, which would be in the way of sections that are not yet square."""
+TAIL: Final = 16
+"""Points at the end of a path that follow its growth."""
+TAIL_ROUNDS: Final = 2
+STRAIGHT: Final = 1.2
+"""So many radii before a cap a path goes straight on."""
+FARTHEST: Final = 5.0
+"""An end further away than so many radii is not looked for."""
+FREE_BEFORE_CAP: Final = 0.5
+"""A centreline ends so many radii before a cap."""
+CONE: Final = np.radians(35.0)
+"""Half of the angle of the cone in which a cap is looked for."""
+CONE_RAYS: Final = 8
+LEAST_WALL: Final = 0.6
+"""Fraction of a ring that meets the wall where a mouth begins: half at the middle of an oblique one."""
+
+
+def centre_path(scene: RayScene, path: Floats, radii: Floats) -> Floats:
+    """A path (P, 3), with the radii (P,) of the tube along it, moved into the centres of the sections, (M, 3).
+
+    Points stand `STEP` radii apart. The ends are cut off where a cap is in the way of whole sections. Sections that
+    side branches open are closed first, see `close_sideways`.
+    """
+    points, radii = _respace(path, radii)
+    points = _keep_free(scene, points, _smooth(points, FIRST_SMOOTHING))
+    kept = _before_caps(scene, points, radii)
+    points, radii = points[kept], radii[kept]
+    for _ in range(ROUNDS):
+        points, radii = _respace(points, radii)
+        rings = measure_rings(scene, points, _tangents(points))
+        closed = close_sideways(rings.distances, STEP)
+        radii = closed.mean(axis=1)
+        moved = _keep_free(scene, points, points + GAIN * offsets_of_centres(rings, closed))
+        moved = _keep_free(scene, moved, _smooth(moved, SMOOTHING))
+        most = float((np.linalg.norm(moved - points, axis=1) / radii).max())
+        points = moved
+        if most < SETTLED:
+            break
+    return points
+
+
+def _before_caps(scene: RayScene, points: Floats, radii: Floats) -> slice:
+    """The part of a path (M, 3) from whose ends no wall is near ahead."""
+    tangents, third = _tangents(points), max(len(points) // 3, 1)
+    ahead = _wall_ahead(scene, points[-third:], tangents[-third:])[::-1] > BLIND * radii[-third:][::-1]
+    behind = _wall_ahead(scene, points[:third], -tangents[:third]) > BLIND * radii[:third]
+    start = int(np.argmax(behind)) if behind.any() else 0
+    stop = int(np.argmax(ahead)) if ahead.any() else 0
+    return slice(start, len(points) - stop)
+
+
+def _wall_ahead(scene: RayScene, points: Floats, tangents: Floats) -> Floats:
+    """How far along the tangents (M, 3) from points (M, 3) a wall stands across the whole way (m), (M,).
+
+    The furthest along any of a narrow cone of rays: in a bend one of them looks around the corner.
+    """
+    side = np.cross(tangents, np.eye(3)[np.argmin(np.abs(tangents), axis=1)])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    around = ring_directions(side, np.cross(tangents, side))[:, :: RING // CONE_RAYS]
+    directions = np.cos(CONE) * tangents[:, None] + np.sin(CONE) * around
+    origins = np.repeat(points, directions.shape[1], axis=0)
+    distances = scene.distances(origins, directions.reshape(-1, 3), np.inf).reshape(len(points), -1)
+    ahead: Floats = np.cos(CONE) * distances.max(axis=1)
+    return ahead
+
+
+def _respace(points: Floats, radii: Floats) -> tuple[Floats, Floats]:
+    """Points (M, 3) a fixed share of the local radius apart, M >= 5, and the radii there."""
+    chords = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(2.0 * chords / (radii[1:] + radii[:-1]))])
+    wanted = np.linspace(0.0, along[-1], max(int(np.ceil(along[-1] / STEP)), 4) + 1)
+    spaced = np.stack([np.interp(wanted, along, points[:, k]) for k in range(3)], axis=1)
+    return spaced, np.interp(wanted, along, radii)
+
+
+def to_the_end(scene: RayScene, points: Floats) -> tuple[Floats, bool]:
+    """Prolong some points (M, 3), `STEP` radii apart, to the mouth of the tube, or up to its cap.
+
+    It grows by one step at a time, and its last part is centred anew after each, so that it follows a bend.
+
+    Returns:
+        All points, and whether there is a cap.
+    """
+    for _ in range(round(FARTHEST / STEP)):
+        tail = points[-TAIL:]
+        tangents = _tangents(tail)
+        rings = measure_rings(scene, tail, tangents)
+        typical = close_sideways(rings.distances, STEP)[-1]
+        radius = float(typical.mean())
+        free = float(_wall_ahead(scene, tail[-1:], tangents[-1:])[0])
+        if free < FREE_BEFORE_CAP * radius:
+            return points, True
+        # The mouth may lie before the next point: come closer in twenty steps.
+        closer = tail[-1] + np.linspace(0.05, 1.0, 20)[:, None] * STEP * radius * tangents[-1]
+        looks = scene.distances(np.repeat(closer, RING, axis=0), np.tile(rings.directions[-1], (20, 1)), np.inf)
+        inside = (looks.reshape(20, RING) < SIDEWAYS * typical).mean(axis=1) >= LEAST_WALL
+        if not inside.all():
+            return np.concatenate([points, closer[: int(np.argmin(inside))][-1:]]), False
+        points = np.concatenate([points, closer[-1:]])
+        if free > STRAIGHT * radius:
+            points = np.concatenate([points[:-TAIL], _settle(scene, points[-TAIL:])])
+    return points, False
+
+
+def _settle(scene: RayScene, tail: Floats) -> Floats:
+    """The last points (T, 3) of a path, the second half of them centred."""
+    fixed = len(tail) // 2
+    for _ in range(TAIL_ROUNDS):
+        rings = measure_rings(scene, tail, _tangents(tail))
+        offsets = offsets_of_centres(rings, close_sideways(rings.distances, STEP))
+        offsets[:fixed] = 0.0
+        tail = _keep_free(scene, tail, tail + GAIN * offsets)
+        tail = np.concatenate([tail[:fixed], _smooth(tail, SMOOTHING)[fixed:]])
+    return tail
+
+
+def _smooth(points: Floats, radii: float) -> Floats:
+    """A cubic through each point's neighbours within so many radii to either side."""
+    window = _window(points, radii)
+    return savgol_filter(points, window, 3, axis=0) if window > 3 else points
+
+
+def _tangents(points: Floats) -> Floats:
+    """Unit tangents (M, 3) of points (M, 3), smoothed."""
+    window = _window(points, TANGENT)
+    if window <= 3:
+        return unit_tangents(points)
+    tangents: Floats = savgol_filter(points, window, 3, deriv=1, axis=0)
+    return tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
+
+
+def _window(points: Floats, radii: float) -> int:
+    return min(2 * max(round(radii / STEP), 2) + 1, (len(points) - 1) // 2 * 2 + 1)
+
+
+def _keep_free(scene: RayScene, points: Floats, moved: Floats) -> Floats:
+    """The moved points (M, 3); where a wall lies on the way, the points themselves."""
+    blocked = scene.blocked(points, moved)
+    return np.where(blocked[:, None], points, moved)
