@@ -33,9 +33,12 @@ PAGE: Final = "report.html"
 """Name of the page where none is given."""
 RECORDS: Final = 25_000
 """Records that a page holds, of all its runs together; of more, every second, third and so on."""
-TRIANGLES: Final = 150_000
-"""Triangles that a page holds, of all its tubes together."""
-SCRIPTS: Final = ("data.js", "tube.js", "view.js", "plots.js", "tables.js", "player.js", "page.js")
+TRIANGLES: Final = 80_000
+"""Triangles that a page holds, of all its tubes together; of more, each tube keeps the same share."""
+SCRIPTS: Final = (
+    "data.js", "shapes.js", "tube.js", "senses.js", "view.js", "charts.js", "plots.js", "tables.js",
+    "evaluation.js", "player.js", "page.js",
+)  # fmt: skip
 """Parts of the page's one script, in order."""
 
 _ALIGNMENT: Final = 8
@@ -144,10 +147,9 @@ def _describe(runs: Sequence[Run], arrays: Arrays) -> tuple[list[dict[str, Any]]
     scenes = [read_scene(run) for run in runs]
     keys = [_tube_key(run, scene) for run, scene in zip(runs, scenes, strict=True)]
     shown = list(dict.fromkeys(keys))
-    tubes = []
-    for key in shown:
-        own = [scene for scene, other in zip(scenes, keys, strict=True) if other == key]
-        tubes.append(describe_tube(own, TRIANGLES // len(shown), arrays.add))
+    flown_in = [[scene for scene, own in zip(scenes, keys, strict=True) if own == key] for key in shown]
+    share = TRIANGLES / max(sum(len(own[0].tube.faces) for own in flown_in), 1)
+    tubes = [describe_tube(own, share, arrays.add) for own in flown_in]
     described = [
         describe_run(run, scene, Kept.of(len(run.records), stride), arrays.add) | {"tube": shown.index(key)}
         for run, scene, key in zip(runs, scenes, keys, strict=True)

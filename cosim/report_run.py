@@ -37,6 +37,13 @@ _TEXTS: Final = {
 }
 
 
+_STATUS: Final = {
+    "running": "its manifest was never finished: the run was cut short, or still flies",
+    "interrupted": "the run was interrupted",
+    "failed": "the run ended with an error",
+}
+
+
 @dataclass(frozen=True)
 class Kept:
     """Which records of a run the page holds: every `stride`-th and the last."""
@@ -73,7 +80,7 @@ def describe_run(run: Run, scene: Scene, kept: Kept, add: AddArray) -> dict[str,
         "records": len(run.records),
         "stride": kept.stride,
         "dt": manifest["session"]["dt"],
-        "note": scene.note,
+        "notes": [note for note in (_STATUS.get(manifest["status"]), scene.note) if note],
         "body_radius": manifest["parameters"]["body_radius"],
         "lidar": settings["lidar"],
         "camera": settings["camera"] | {"field_of_view": manifest["conditions"]["drawn"]["field_of_view"]},
@@ -110,10 +117,10 @@ def _story(run: Run) -> dict[str, Any]:
         "outcome": "cut short" if ended is Outcome.RUNNING else ended.name.lower(),
         "steps": int(last["step"]),
         "sim_time": float(last["sim_time"]),
-        "progress": float(last["progress"]),
+        "progress": _number(last["progress"]),
         "length": run.manifest["mesh"]["length_m"],
-        "quality": float(last["quality"]),
-        "gap": float(clearance[narrowest]) - run.manifest["parameters"]["body_radius"],
+        "quality": _number(last["quality"]),
+        "gap": _number(clearance[narrowest] - run.manifest["parameters"]["body_radius"]),
         "gap_time": float(run.records["sim_time"][narrowest]),
         "contacts": int(np.count_nonzero(column(run, "contact"))),
         "steps_per_second": told.get("steps_per_second"),
@@ -132,6 +139,8 @@ def _series(run: Run, scene: Scene, index: NDArray[np.int64]) -> dict[str, NDArr
     def flag(name: str) -> NDArray[np.uint8]:
         return records[name].astype(np.uint8)
 
+    step = CURVATURE_STEP * float(np.median(column(run, "radius")))
+    curvature = curvature_along(column(run, "arc_length"), column(run, "tangent"), step)
     reach = run.manifest["settings"]["lidar"]["reach"]
     observation, labels = records["observation"], _labels(run, "observation")
     return {
@@ -143,7 +152,7 @@ def _series(run: Run, scene: Scene, index: NDArray[np.int64]) -> dict[str, NDArr
         "arc_length": single("arc_length"),
         "radius": single("radius"),
         "clearance": single("clearance"),
-        "curvature": _single(curvature_along(run)[index]),
+        "curvature": _single(curvature[index]),
         "speed": _single(np.linalg.norm(records["linear_velocity"], axis=1)),
         "commanded_speed": single("commanded_speed"),
         "alignment": single("alignment"),
@@ -170,21 +179,25 @@ def _series(run: Run, scene: Scene, index: NDArray[np.int64]) -> dict[str, NDArr
     }
 
 
-def curvature_along(run: Run) -> Floats:
-    """Curvature of the axis (1/m) at the nearest axis point of every record, (T,), from the recorded tangents.
+def curvature_along(arc_length: Floats, tangents: Floats, step: float) -> Floats:
+    """Curvature of the axis (1/m) at every record, (T,), from the axis as it came by.
 
-    NaN for a flight along less of the axis than a turn is taken over.
+    Args:
+        arc_length: (T,) of the nearest axis point (m), in any order.
+        tangents: (T, 3) of the axis there.
+        step: arc length over which a turn is taken (m).
+
+    Returns:
+        NaN everywhere for a flight along less than two steps of the axis.
     """
-    along, radius, tangents = column(run, "arc_length"), column(run, "radius"), column(run, "tangent")
-    step = CURVATURE_STEP * float(np.median(radius))
-    places, first = np.unique(along, return_index=True)
+    places, first = np.unique(arc_length, return_index=True)
     count = int((places[-1] - places[0]) / step) + 1
-    if count < 2:
-        return np.full(len(along), np.nan)
+    if count <= 2:
+        return np.full(len(arc_length), np.nan)
     even = places[0] + step * np.arange(count)
     sampled = np.stack([np.interp(even, places, tangents[first, c]) for c in range(3)], axis=1)
     sampled /= np.linalg.norm(sampled, axis=1, keepdims=True)
-    curvature: Floats = np.interp(along, even[:-1] + 0.5 * step, segment_curvature(sampled, step))
+    curvature: Floats = np.interp(arc_length, even[:-1] + 0.5 * step, segment_curvature(sampled, step))
     return curvature
 
 
@@ -220,6 +233,11 @@ def phase_rows(run: Run) -> dict[str, Any]:
 
 def _labels(run: Run, name: str) -> tuple[str, ...]:
     return next(field.labels for field in run.columns if field.name == name)
+
+
+def _number(value: Any) -> float | None:
+    """For JSON, which knows no NaN and no infinity."""
+    return float(value) if np.isfinite(value) else None
 
 
 def _single(values: NDArray[Any]) -> NDArray[np.float32]:

@@ -8,9 +8,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.errors import CosimError
 from cosim.report_run import AddArray
-from cosim.scene import Scene
-from meshes.thinning import thin_surface
+from cosim.scene import Scene, Surface
 
 Floats = NDArray[np.float64]
 
@@ -19,25 +19,46 @@ AXIS_POINTS: Final = 1500
 _PIECE: Final = 4096
 
 
-def describe_tube(scenes: Sequence[Scene], triangles: int, add: AddArray) -> dict[str, Any]:
+def describe_tube(scenes: Sequence[Scene], share: float, add: AddArray) -> dict[str, Any]:
     """The tube of some scenes that share it, as JSON with the numbers of its arrays.
 
     Args:
         scenes: of the runs; the longest axis counts.
-        triangles: that it may have; a mesh of more is thinned.
+        share: of its triangles that the page has room for.
         add: takes the arrays.
+
+    Raises:
+        CosimError: it must be simplified, and the library for that is not installed.
     """
     axis = max((scene.axis for scene in scenes), key=len)
     tube = scenes[0].tube
-    vertices, faces = thin_surface(tube.vertices, tube.faces, triangles)
+    shown = tube if share >= 1.0 else simplify(tube, max(int(share * len(tube.faces)), 1))
     return {
-        "vertices": add(vertices.astype(np.float32)),
-        "faces": add(faces.astype(np.uint16 if len(vertices) <= 2**16 else np.uint32)),
-        "outward": add(outward(vertices, axis)),
+        "vertices": add(shown.vertices.astype(np.float32)),
+        "faces": add(shown.faces.astype(np.uint16 if len(shown.vertices) <= 2**16 else np.uint32)),
+        "outward": add(outward(shown.vertices, axis)),
         "axis": add(axis.astype(np.float32)),
-        "triangles": len(faces),
+        "triangles": len(shown.faces),
         "triangles_flown": len(tube.faces),
     }
+
+
+def simplify(surface: Surface, triangles: int) -> Surface:
+    """The same surface with about so many triangles, where they change its shape least.
+
+    Raises:
+        CosimError: fast-simplification is not installed.
+    """
+    try:
+        import fast_simplification  # type: ignore[import-untyped]  # quadric error metrics
+    except ImportError as error:
+        raise CosimError(
+            "large meshes need fast-simplification; install it with: pip install fast-simplification"
+        ) from error
+    vertices, faces = fast_simplification.simplify(
+        surface.vertices.astype(np.float32), surface.faces.astype(np.int32), target_count=triangles
+    )
+    return Surface(vertices.astype(np.float64), faces)
 
 
 def outward(vertices: Floats, axis: Floats) -> NDArray[np.int8]:

@@ -1,7 +1,13 @@
 // The data of the page: JSON with the numbers of its arrays, and the arrays.
 
 const TYPES = {
-  f4: Float32Array, u1: Uint8Array, i1: Int8Array, u2: Uint16Array, i2: Int16Array, u4: Uint32Array, i4: Int32Array,
+  f4: Float32Array,
+  u1: Uint8Array,
+  i1: Int8Array,
+  u2: Uint16Array,
+  i2: Int16Array,
+  u4: Uint32Array,
+  i4: Int32Array,
 };
 
 /** The data as `cosim/report.py` put it together, with every series as a typed array. */
@@ -10,7 +16,11 @@ async function readData() {
   const block = await inflate(document.getElementById("arrays").textContent);
   const array = (number) => {
     const { type, shape, at } = data.arrays[number];
-    return new TYPES[type](block, at, shape.reduce((a, b) => a * b, 1));
+    return new TYPES[type](
+      block,
+      at,
+      shape.reduce((a, b) => a * b, 1),
+    );
   };
   for (const tube of data.tubes) {
     for (const name of ["vertices", "faces", "outward", "axis"]) tube[name] = array(tube[name]);
@@ -37,7 +47,8 @@ async function inflate(base64) {
 /** Where a run is at a time: the record at or before it, and how far on the way to the next, 0 to 1. */
 function recordAt(run, time) {
   const times = run.series.time;
-  let low = 0, high = run.count - 1;
+  let low = 0,
+    high = run.count - 1;
   while (low < high) {
     const middle = (low + high + 1) >> 1;
     if (times[middle] <= time) low = middle;
@@ -56,6 +67,11 @@ function say(value, digits = 3) {
   const size = Math.floor(Math.log10(Math.abs(value)));
   const text = size >= digits ? Math.round(value).toLocaleString("en") : value.toFixed(Math.min(digits - 1 - size, 6));
   return text.replace("-", "−");
+}
+
+/** A number with so many decimals, or a dash. */
+function fixed(value, digits) {
+  return Number.isFinite(value) ? value.toFixed(digits).replace("-", "−") : "–";
 }
 
 function sayTime(seconds) {

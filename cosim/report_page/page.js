@@ -4,7 +4,12 @@ const CLEARANCE_COLOURS = ["#c8102e", "#ee6c2b", "#f4b942", "#8fc1a9", "#2f9e9e"
 
 /** What a path can be coloured by: value of a record, and the range that the colours span. */
 const PATH_COLOURS = {
-  clearance: { text: "gap to the wall", unit: "m", value: (run, i) => run.series.clearance[i] - run.body_radius, low: () => 0 },
+  clearance: {
+    text: "gap to the wall",
+    unit: "m",
+    value: (run, i) => run.series.clearance[i] - run.body_radius,
+    low: () => 0,
+  },
   speed: { text: "speed", unit: "m/s", value: (run, i) => run.series.speed[i], low: () => 0 },
   reward: { text: "reward of a step", unit: "", value: (run, i) => rewardCurves(run)[0].values[i] },
 };
@@ -16,10 +21,12 @@ function labelRuns(runs) {
 }
 
 function rangeOf(runs, by) {
-  let low = Infinity, high = -Infinity;
+  let low = Infinity,
+    high = -Infinity;
   for (const run of runs) {
     for (let i = 0; i < run.count; i++) {
       const value = by.value(run, i);
+      if (!Number.isFinite(value)) continue;
       if (value < low) low = value;
       if (value > high) high = value;
     }
@@ -29,12 +36,15 @@ function rangeOf(runs, by) {
 }
 
 /** Colours of a path, 3 a record in linear RGB; null where it has its run's own. */
-function pathColours(run, by, [low, high]) {
-  const colours = new Float32Array(3 * run.count), stops = CLEARANCE_COLOURS.map((text) => new THREE.Color(text)), mixed = new THREE.Color();
+function pathColours(run, by, [low, high] = [0, 1]) {
+  const colours = new Float32Array(3 * run.count),
+    stops = CLEARANCE_COLOURS.map((text) => new THREE.Color(text)),
+    mixed = new THREE.Color();
   const own = new THREE.Color(cssColour(`--run-${run.number % 8}`));
   for (let i = 0; i < run.count; i++) {
     if (by) {
-      const place = Math.min(Math.max((by.value(run, i) - low) / (high - low), 0), 1) * (stops.length - 1), stop = Math.min(Math.floor(place), stops.length - 2);
+      const place = Math.min(Math.max((by.value(run, i) - low) / (high - low), 0), 1) * (stops.length - 1),
+        stop = Math.min(Math.floor(place), stops.length - 2);
       mixed.lerpColors(stops[stop], stops[stop + 1], place - stop);
     } else mixed.copy(own);
     mixed.toArray(colours, 3 * i);
@@ -53,21 +63,45 @@ class Report {
   }
 
   _words() {
-    const { data, runs } = this, seek = (time) => { this.player.pause(); this.player.seek(time); };
+    const { data, runs } = this,
+      seek = (time) => {
+        this.player.pause();
+        this.player.seek(time);
+      };
     byId("made").textContent = `made by cosim ${data.made.cosim} on ${data.made.at}`;
-    const fill = (id, ...content) => { byId(id).hidden = false; byId(id).append(...content); };
+    const fill = (id, ...content) => {
+      byId(id).hidden = false;
+      byId(id).append(...content);
+    };
     if (data.evaluations.length) {
       byId("headline").append(make("p", { class: "kicker" }, "cosim report"));
-      fill("evaluations", ...data.evaluations.flatMap((evaluation) => evaluationOf(evaluation, runs, (run, time) => this.focusOn(run, time))));
+      fill(
+        "evaluations",
+        ...data.evaluations.flatMap((evaluation) =>
+          evaluationOf(evaluation, runs, (run, time) => this.focusOn(run, time)),
+        ),
+      );
     } else if (!this.many) byId("headline").append(...headlineOf(runs[0], seek), ...thinnedNotes(data));
     else {
       const flown = runs.filter((run) => run.outcome === "success").length;
-      byId("headline").append(make("p", { class: "kicker" }, "cosim report"), make("h1", {}, `${runs.length} runs`),
-        make("p", { class: "lead" }, `${flown} of ${runs.length} reached the end.`));
+      byId("headline").append(
+        make("p", { class: "kicker" }, "cosim report"),
+        make("h1", {}, `${runs.length} runs`),
+        make("p", { class: "lead" }, `${flown} of ${runs.length} reached the end.`),
+      );
     }
     if (this.many || (runs.length && data.evaluations.length)) {
-      fill("runs", data.evaluations.length ? make("h2", {}, "Replays") : "", runsTable(runs, (run) => this.focusOn(run), (run, shown) => this.show(run, shown)),
-        ...notesOf(runs), ...thinnedNotes(data));
+      fill(
+        "runs",
+        data.evaluations.length ? make("h2", {}, "Replays") : "",
+        runsTable(
+          runs,
+          (run) => this.focusOn(run),
+          (run, shown) => this.show(run, shown),
+        ),
+        ...notesOf(runs),
+        ...thinnedNotes(data),
+      );
     }
   }
 
@@ -75,12 +109,16 @@ class Report {
     const { data, runs } = this;
     for (const id of ["replay", "transport", "plots", "phases", "settings"]) byId(id).hidden = false;
     this.player = new Player(runs, (time) => this._place(time));
-    this.plots = new Plots(data, byId("charts"), (time) => { this.player.pause(); this.player.seek(time); });
+    this.plots = new Plots(data, byId("charts"), (time) => {
+      this.player.pause();
+      this.player.seek(time);
+    });
     try {
       this.view = new View(data, byId("canvas"));
     } catch (error) {
       byId("no-view").hidden = false;
-      byId("no-view").textContent = `No 3-D here, since this browser has no WebGL (${error.message}). Everything else works.`;
+      byId("no-view").textContent =
+        `No 3-D here, since this browser has no WebGL (${error.message}). Everything else works.`;
     }
     this.colourBy = this.many ? "run" : "clearance";
     this._controls();
@@ -104,36 +142,65 @@ class Report {
         this.plots.draw();
       });
     }
-    byId("abscissa").before(this._select("Span", { Infinity: "all", 60: "60 s", 20: "20 s", 5: "5 s" }, "Infinity", (value) => {
-      this.plots.span = +value;
-      this.plots.draw();
-    }));
+    byId("abscissa").before(
+      this._select("Span", { Infinity: "all", 60: "60 s", 20: "20 s", 5: "5 s" }, "Infinity", (value) => {
+        this.plots.span = +value;
+        this.plots.draw();
+      }),
+    );
     const { view } = this;
     if (!view) return;
     byId("camera").addEventListener("change", (event) => view.setCamera(event.target.value));
     for (const [name, text] of Object.entries(LAYERS)) {
-      const button = make("button", { type: "button", "aria-pressed": "true", onclick: () => {
-        press(button, !view.layers[name]);
-        view.setLayer(name, !view.layers[name]);
-      } }, text);
+      const button = make(
+        "button",
+        {
+          type: "button",
+          "aria-pressed": "true",
+          onclick: () => {
+            press(button, !view.layers[name]);
+            view.setLayer(name, !view.layers[name]);
+          },
+        },
+        text,
+      );
       byId("layers").append(button);
     }
-    byId("layers").prepend(this._select("Tube", { glass: "glass", cut: "cut open", whole: "solid", off: "hidden" }, "glass", (value) => view.setTube(value)));
-    const colours = Object.fromEntries([...(this.many ? [["run", "run"]] : []), ...Object.entries(PATH_COLOURS).map(([name, { text }]) => [name, text])]);
+    byId("layers").prepend(
+      this._select("Tube", { glass: "glass", cut: "cut open", whole: "solid", off: "hidden" }, "glass", (value) =>
+        view.setTube(value),
+      ),
+    );
+    const colours = Object.fromEntries([
+      ...(this.many ? [["run", "run"]] : []),
+      ...Object.entries(PATH_COLOURS).map(([name, { text }]) => [name, text]),
+    ]);
     this.scale = make("div", { class: "gradient" });
-    byId("scale").append(this._select("Path by", colours, this.colourBy, (value) => { this.colourBy = value; this.paint(); }), this.scale);
+    byId("scale").append(
+      this._select("Path by", colours, this.colourBy, (value) => {
+        this.colourBy = value;
+        this.paint();
+      }),
+      this.scale,
+    );
   }
 
   _select(label, options, chosen, onChange) {
-    const select = make("select", { onchange: () => onChange(select.value) },
-      ...Object.entries(options).map(([value, text]) => make("option", { value, selected: value === chosen && "" }, text)));
+    const select = make(
+      "select",
+      { onchange: () => onChange(select.value) },
+      ...Object.entries(options).map(([value, text]) =>
+        make("option", { value, selected: value === chosen && "" }, text),
+      ),
+    );
     return make("label", {}, label, " ", select);
   }
 
   /** Colours of everything in the view, and the scale that explains the path's. */
   paint() {
     if (!this.view) return;
-    const by = PATH_COLOURS[this.colourBy], range = by && rangeOf(this.runs, by);
+    const by = PATH_COLOURS[this.colourBy],
+      range = by && rangeOf(this.runs, by);
     this.view.paint((run) => pathColours(run, by, range));
     this.view.place(this.player.time);
     this.scale.hidden = !by;
@@ -181,24 +248,44 @@ class Report {
   }
 
   _readout(time) {
-    const run = this.focus, s = run.series, { record: i } = recordAt(run, time);
+    const run = this.focus,
+      s = run.series,
+      { record: i } = recordAt(run, time);
     const entries = [
-      ["step", `${s.step[i].toLocaleString("en")} of ${run.steps.toLocaleString("en")}`], ["along the axis", `${say(s.arc_length[i])} m`],
-      ["gap to the wall", `${say(s.clearance[i] - run.body_radius)} m`], ["speed", `${say(s.speed[i])} m/s`],
-      ["goes by", { visible: "the target", memory: "its memory", blind: "the walls alone" }[REGIMES[s.regime[i]]] ?? "–"],
-      ["alignment", say(s.alignment[i])], ["turn confidence", say(s.C_turn[i])], ["reward", say(s.reward[i])],
-      ["action", s.action[i] < 0 ? "–" : `${s.action[i]} of 36`], ["entropy", Number.isFinite(s.entropy[i]) ? `${say(s.entropy[i])} nat` : "–"],
+      ["step", `${s.step[i].toLocaleString("en")} of ${run.steps.toLocaleString("en")}`],
+      ["along the axis", `${fixed(s.arc_length[i], 2)} m`],
+      ["gap to the wall", `${fixed(s.clearance[i] - run.body_radius, 3)} m`],
+      ["speed", `${fixed(s.speed[i], 2)} m/s`],
+      [
+        "goes by",
+        { visible: "the target", memory: "its memory", blind: "the walls alone" }[REGIMES[s.regime[i]]] ?? "–",
+      ],
+      ["alignment", fixed(s.alignment[i], 3)],
+      ["turn confidence", fixed(s.C_turn[i], 3)],
+      ["reward", fixed(s.reward[i], 2)],
+      ["action", s.action[i] < 0 ? "–" : `${s.action[i]} of 36`],
+      ["entropy", Number.isFinite(s.entropy[i]) ? `${fixed(s.entropy[i], 2)} nat` : "–"],
     ];
     if (this.many) entries.unshift(["run", run.label]);
-    byId("readout").replaceChildren(...entries.map(([name, value]) => make("div", {}, make("dt", {}, name), make("dd", {}, value))));
+    byId("readout").replaceChildren(
+      ...entries.map(([name, value]) => make("div", {}, make("dt", {}, name), make("dd", {}, value))),
+    );
   }
 
   /** What is shown now: record and time, whether it plays, and where each drone stands (m). */
   state() {
     const places = this.view?.runs.map((view) => view.drone.position.toArray());
-    return { record: this.player.record, time: this.player.time, playing: this.player.playing, focus: this.focus.number, positions: places };
+    return {
+      record: this.player.record,
+      time: this.player.time,
+      playing: this.player.playing,
+      focus: this.focus.number,
+      positions: places,
+    };
   }
 }
 
 window.cosimReport = readData().then((data) => new Report(data));
-window.cosimReport.then(() => { document.body.dataset.ready = "true"; });
+window.cosimReport.then(() => {
+  document.body.dataset.ready = "true";
+});

@@ -17,7 +17,9 @@ class Player {
     byId("back").addEventListener("click", () => this.step(-1));
     byId("forward").addEventListener("click", () => this.step(1));
     const chosen = RATES.find((rate) => rate >= 1 && this.guide.end / rate <= LONGEST_REPLAY) ?? RATES.at(-1);
-    byId("rate").append(...RATES.map((rate) => make("option", { value: rate, selected: rate === chosen && "" }, `${rate} ×`)));
+    byId("rate").append(
+      ...RATES.map((rate) => make("option", { value: rate, selected: rate === chosen && "" }, `${rate} ×`)),
+    );
     document.addEventListener("keydown", (event) => this._key(event));
   }
 
@@ -27,7 +29,8 @@ class Player {
 
   seek(time) {
     this.time = Math.min(Math.max(time, 0), this.guide.end);
-    const record = this.record, value = this.guide.series.step[record];
+    const record = this.record,
+      value = this.guide.series.step[record];
     this.slider.value = record;
     this.slider.setAttribute("aria-valuetext", `step ${value}, ${this.time.toFixed(1)} seconds`);
     byId("clock").textContent = `${this.time.toFixed(1)} s`;

@@ -1,101 +1,44 @@
 // Curves over time or arc length, drawn as SVG so that they follow the colour scheme and print well.
 
-const HEIGHT = 132, MARGIN = { left: 40, right: 8, top: 6, bottom: 18 };
-
-/** What is plotted: `curves(run)` gives label and values of each curve; the first one is shown where there are many runs. */
-const CHARTS = [
-  {
-    name: "clearance", title: "Clearance", unit: "m", floor: 0,
-    curves: (run) => [
-      { label: "centre to wall", values: run.series.clearance },
-      { label: "local radius R", values: run.series.radius, quiet: true },
-    ],
-    lines: (run) => [{ label: "body", value: run.body_radius, bad: true }],
-  },
-  {
-    name: "curvature", title: "Curvature of the axis", unit: "1/m", floor: 0,
-    curves: (run) => [{ label: "here", values: run.series.curvature }],
-  },
-  {
-    name: "speed", title: "Speed", unit: "m/s", floor: 0,
-    curves: (run) => [
-      { label: "flown", values: run.series.speed },
-      { label: "commanded", values: run.series.commanded_speed, quiet: true },
-    ],
-  },
-  {
-    name: "alignment", title: "Alignment and centring", unit: "", ceiling: 1,
-    curves: (run) => [
-      { label: "alignment", values: run.series.alignment },
-      { label: "centring", values: run.series.centring },
-      { label: "Q so far", values: run.series.quality },
-    ],
-  },
-  { name: "reward", title: "Reward by its terms", unit: "", floor: 0, curves: rewardCurves },
-  { name: "regime", title: "What the drone goes by", unit: "", strip: true },
-  {
-    name: "symmetry", title: "LiDAR symmetry", unit: "", floor: 0, ceiling: 1,
-    curves: (run) => [
-      { label: "front S_F", values: seen(run, "s_f") ? run.series.S_F : null },
-      { label: "rear S_R", values: seen(run, "s_r") ? run.series.S_R : null },
-      { label: "turn C_turn", values: run.series.C_turn },
-    ],
-  },
-  {
-    name: "memory", title: "Since the target was seen", unit: "steps", floor: 0,
-    curves: (run) => [{ label: "age of the memory", values: run.series.memory_age }],
-    lines: (run) => [{ label: "forgotten", value: run.memory_steps }],
-  },
-  {
-    name: "entropy", title: "Entropy of the policy", unit: "nat", floor: 0,
-    curves: (run) => [{ label: "of the 36 actions", values: run.series.entropy }],
-    missing: "no distribution: this pilot chooses by rule",
-  },
-  {
-    name: "step_time", title: "Time of a step", unit: "ms", floor: 0, clipped: true,
-    curves: (run) => [{ label: "without recording", values: run.step_ms ??= run.series.step_time.map((s) => 1e3 * s) }],
-  },
-];
-
-/** Whether the policy was shown a feature: what it was not shown is zero in its observation. */
-function seen(run, feature) {
-  return !run.hidden.includes(feature);
-}
-
-function rewardCurves(run) {
-  run.reward_curves ??= (() => {
-    const names = run.terms, all = run.series.reward_terms, end = names.indexOf("terminal");
-    const values = names.map((_, t) => Float32Array.from({ length: run.count }, (_, i) => all[names.length * i + t]));
-    const sum = run.series.reward.map((reward, i) => reward - values[end][i]);
-    const shown = names.map((name, t) => ({ label: name.replace("_", " "), values: values[t] }))
-      .filter((curve, t) => t !== end && curve.values.some((value) => value !== 0));
-    return [{ label: "sum without the end’s", values: sum }, ...shown];
-  })();
-  return run.reward_curves;
-}
+const HEIGHT = 132,
+  MARGIN = { left: 48, right: 8, top: 6, bottom: 18 };
 
 /** Ticks at 1, 2 or 5 times a power of ten, about `count` of them. */
 function ticks(low, high, count) {
-  const rough = (high - low) / count || 1, power = 10 ** Math.floor(Math.log10(rough));
+  const rough = (high - low) / count || 1,
+    power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].find((n) => n * power >= rough) * power;
   const found = [];
   for (let n = Math.ceil(low / step - 1e-9); n * step <= high + 1e-9 * step; n++) found.push(n * step);
-  return found.map((value) => ({ value, text: say(+value.toFixed(10), 3).replace(/(\.\d*?)0+$/, "$1").replace(/\.$/, "") }));
+  return found.map((value) => ({
+    value,
+    text: say(+value.toFixed(10), 3)
+      .replace(/(\.\d*?)0+$/, "$1")
+      .replace(/\.$/, ""),
+  }));
 }
 
 /** A path through records `from` to `to` with no more detail than pixels: of many, first, least, greatest and last. */
 function trace(xs, ys, from, to, toX, toY, width) {
   const chunk = Math.max(1, Math.floor((to - from + 1) / width));
-  let path = "", pen = false;
+  let path = "",
+    pen = false;
   const put = (i) => {
-    if (!Number.isFinite(ys[i])) { pen = false; return; }
+    if (!Number.isFinite(ys[i])) {
+      pen = false;
+      return;
+    }
     path += `${pen ? "L" : "M"}${toX(xs[i]).toFixed(1)} ${toY(ys[i]).toFixed(1)}`;
     pen = true;
   };
   for (let start = from; start <= to; start += chunk) {
     const stop = Math.min(start + chunk - 1, to);
-    if (chunk < 4) { for (let i = start; i <= stop; i++) put(i); continue; }
-    let least = start, most = start;
+    if (chunk < 4) {
+      for (let i = start; i <= stop; i++) put(i);
+      continue;
+    }
+    let least = start,
+      most = start;
     for (let i = start; i <= stop; i++) {
       if (!(ys[i] >= ys[least])) least = i;
       if (!(ys[i] <= ys[most])) most = i;
@@ -111,9 +54,14 @@ class Chart {
     this.plots = plots;
     this.legend = make("div", { class: "legend" });
     this.svg = make("svg", { role: "img", "aria-label": definition.title, height: HEIGHT });
-    const unit = definition.unit ? make("small", {}, definition.unit) : null;
-    this.root = make("figure", { class: "chart", id: `chart-${definition.name}` },
-      make("figcaption", {}, make("b", {}, definition.title), unit, this.legend), this.svg);
+    const first = plots.all.length > 1 ? definition.curves?.(plots.all[0])[0].label : null;
+    const unit = make("small", {}, [first, definition.unit].filter(Boolean).join(", "));
+    this.root = make(
+      "figure",
+      { class: definition.wide ? "chart wide" : "chart", id: `chart-${definition.name}` },
+      make("figcaption", {}, make("b", {}, definition.title), unit, this.legend),
+      this.svg,
+    );
     for (const kind of ["pointerdown", "pointermove"]) {
       this.svg.addEventListener(kind, (event) => {
         if (kind === "pointerdown") this.svg.setPointerCapture(event.pointerId);
@@ -127,26 +75,35 @@ class Chart {
     const { definition, plots } = this;
     if (definition.strip) return [];
     const many = plots.runs.length > 1;
-    return plots.runs.flatMap((run) => definition.curves(run)
-      .map((curve, i) => ({ ...curve, run, colour: many ? runColour(run) : `var(--curve-${i % 8})` }))
-      .filter((curve, i) => curve.values && (!many || i === 0))
-      .map((curve) => (many ? { ...curve, label: run.label, quiet: false } : curve)))
+    return plots.runs
+      .flatMap((run) =>
+        definition
+          .curves(run)
+          .map((curve, i) => ({ ...curve, run, colour: many ? runColour(run) : `var(--curve-${i % 8})` }))
+          .filter((curve, i) => curve.values && (!many || i === 0))
+          .map((curve) => (many ? { ...curve, label: run.label, quiet: false } : curve)),
+      )
       .filter((curve) => curve.values.some(Number.isFinite));
   }
 
   draw() {
-    const { definition, plots } = this, width = this.svg.clientWidth || 300;
+    const { definition, plots } = this,
+      width = this.svg.clientWidth || 300;
     this.svg.setAttribute("viewBox", `0 0 ${width} ${HEIGHT}`);
-    const [left, right] = [MARGIN.left, width - MARGIN.right], [x0, x1] = plots.range;
+    const [left, right] = [MARGIN.left, width - MARGIN.right],
+      [x0, x1] = plots.range;
     this.toX = (x) => left + ((x - x0) / (x1 - x0 || 1)) * (right - left);
     this.fromX = (pixel) => x0 + ((pixel - left) / (right - left)) * (x1 - x0);
     this.drawn = this.curves();
     const body = make("g", { class: "body" });
     if (definition.strip) this._strips(body);
     else if (this.drawn.length) this._curves(body, left, right);
-    else body.append(make("text", { x: left, y: HEIGHT / 2, class: "missing" }, definition.missing ?? "nothing recorded"));
-    const below = ticks(x0, x1, width / 90).map(({ value, text }) =>
-      make("text", { x: this.toX(value), y: HEIGHT - 4, class: "tick x" }, text));
+    else
+      body.append(make("text", { x: left, y: HEIGHT / 2, class: "missing" }, definition.missing ?? "nothing recorded"));
+    const unit = plots.by === "time" ? " s" : " m";
+    const below = ticks(x0, x1, width / 90).map(({ value, text }, i, all) =>
+      make("text", { x: this.toX(value), y: HEIGHT - 4, class: "tick x" }, i === all.length - 1 ? text + unit : text),
+    );
     this.cursor = make("g", { class: "cursor" }, make("line", { y1: MARGIN.top, y2: HEIGHT - MARGIN.bottom }));
     this.svg.replaceChildren(body, ...below, this.cursor);
     this._legend();
@@ -172,8 +129,10 @@ class Chart {
     this.toY = (y) => Math.max(bottom - ((y - low) / (high - low)) * (bottom - MARGIN.top), 0);
     for (const { value, text } of ticks(low, high, 3)) {
       const y = this.toY(value);
-      body.append(make("line", { x1: left, x2: right, y1: y, y2: y, class: "grid" }),
-        make("text", { x: left - 6, y: y + 3.5, class: "tick y" }, text));
+      body.append(
+        make("line", { x1: left, x2: right, y1: y, y2: y, class: "grid" }),
+        make("text", { x: left - 6, y: y + 3.5, class: "tick y" }, text),
+      );
     }
     for (const { value, bad } of lines) {
       const y = this.toY(value);
@@ -188,15 +147,23 @@ class Chart {
 
   /** Bands of colour: regime by regime of the only run with contact below, or the regimes of many runs. */
   _strips(body) {
-    const { plots } = this, many = plots.runs.length > 1;
-    const rows = many ? plots.runs.map((run) => ({ label: "", run, values: run.series.regime, kind: "regime" })) :
-      ["regime", "target_visible", "memory_available", "contact"].map((name) =>
-        ({ label: { regime: "regime", target_visible: "target", memory_available: "memory", contact: "contact" }[name],
-          run: plots.runs[0], values: plots.runs[0].series[name], kind: name === "regime" ? name : `${name} flag` }));
+    const { plots } = this,
+      many = plots.runs.length > 1;
+    const rows = many
+      ? plots.runs.map((run) => ({ label: "", run, values: run.series.regime, kind: "regime" }))
+      : ["regime", "target_visible", "memory_available", "contact"].map((name) => ({
+          label: { regime: "regime", target_visible: "target", memory_available: "memory", contact: "contact" }[name],
+          run: plots.runs[0],
+          values: plots.runs[0].series[name],
+          kind: name === "regime" ? name : `${name} flag`,
+        }));
     const high = (HEIGHT - MARGIN.top - MARGIN.bottom) / rows.length;
     rows.forEach(({ label, run, values, kind }, row) => {
-      const xs = plots.abscissa(run), [from, to] = plots.records(run), y = MARGIN.top + row * high;
-      if (many) body.append(make("circle", { cx: MARGIN.left - 12, cy: y + high / 2, r: 4, style: `fill:${runColour(run)}` }));
+      const xs = plots.abscissa(run),
+        [from, to] = plots.records(run),
+        y = MARGIN.top + row * high;
+      if (many)
+        body.append(make("circle", { cx: MARGIN.left - 12, cy: y + high / 2, r: 4, style: `fill:${runColour(run)}` }));
       else body.append(make("text", { x: MARGIN.left - 6, y: y + high / 2 + 3.5, class: "tick y" }, label));
       let start = from;
       for (let i = from; i <= to; i++) {
@@ -204,34 +171,56 @@ class Chart {
         if (i < to && (values[i + 1] === values[start] || this.toX(xs[i + 1]) - this.toX(xs[start]) < 1)) continue;
         let worst = 0;
         for (let j = start; j <= i; j++) worst = Math.max(worst, values[j]);
-        const a = this.toX(xs[start]), b = this.toX(xs[Math.min(i + 1, to)]);
-        if (worst) body.append(make("rect", { x: Math.min(a, b), y: y + 2, width: Math.max(Math.abs(b - a), 0.7), height: high - 4, class: `${kind} v${worst}` }));
+        const a = this.toX(xs[start]),
+          b = this.toX(xs[Math.min(i + 1, to)]);
+        if (worst)
+          body.append(
+            make("rect", {
+              x: Math.min(a, b),
+              y: y + 2,
+              width: Math.max(Math.abs(b - a), 0.7),
+              height: high - 4,
+              class: `${kind} v${worst}`,
+            }),
+          );
         start = i + 1;
       }
     });
   }
 
   _legend() {
-    const strip = this.definition.strip ? REGIMES.slice(1).map((name, i) => make("span", { class: `key regime v${i + 1}` }, name)) : [];
+    const strip = this.definition.strip
+      ? REGIMES.slice(1).map((name, i) => make("span", { class: `key regime v${i + 1}` }, name))
+      : [];
     this.values = this.drawn.map((curve) => {
       const value = make("output", {});
-      this.legend.append();
       return { curve, value, dot: make("circle", { r: 2.8, style: `fill:${curve.colour}` }) };
     });
     const keys = this.values.map(({ curve, value }) =>
-      make("span", { class: curve.quiet ? "key quiet" : "key", style: `--key:${curve.colour}` }, curve.label, " ", value));
+      make(
+        "span",
+        { class: curve.quiet ? "key quiet" : "key", style: `--key:${curve.colour}` },
+        curve.label,
+        " ",
+        value,
+      ),
+    );
     this.legend.replaceChildren(...strip, ...keys);
     this.cursor.append(...this.values.map(({ dot }) => dot));
   }
 
   /** Move the cursor to where the runs are now. */
   point() {
-    const { plots } = this, focus = plots.focus, { record } = recordAt(focus, plots.time);
-    const x = this.toX(plots.abscissa(focus)[record]).toFixed(1), line = this.cursor.firstChild;
+    const { plots } = this,
+      focus = plots.focus,
+      { record } = recordAt(focus, plots.time);
+    const x = this.toX(plots.abscissa(focus)[record]).toFixed(1),
+      line = this.cursor.firstChild;
     line.setAttribute("x1", x);
     line.setAttribute("x2", x);
     for (const { curve, value, dot } of this.values) {
-      const at = recordAt(curve.run, plots.time).record, y = curve.values[at];
+      const at = recordAt(curve.run, plots.time).record,
+        y = curve.values[at];
       value.textContent = say(y);
       dot.setAttribute("visibility", Number.isFinite(y) ? "visible" : "hidden");
       if (!Number.isFinite(y)) continue;
@@ -268,9 +257,11 @@ class Plots {
   /** Least and greatest x of what is shown. */
   get range() {
     if (this.by === "time" && this.span !== Infinity) return [this.time - this.span / 2, this.time + this.span / 2];
-    let low = Infinity, high = -Infinity;
+    let low = Infinity,
+      high = -Infinity;
     for (const run of this.runs) {
-      const xs = this.abscissa(run), [from, to] = this.records(run);
+      const xs = this.abscissa(run),
+        [from, to] = this.records(run);
       for (let i = from; i <= to; i++) {
         if (xs[i] < low) low = xs[i];
         if (xs[i] > high) high = xs[i];
@@ -297,7 +288,8 @@ class Plots {
 
   /** Go to where the focus was at this x. */
   seek(x) {
-    const xs = this.abscissa(this.focus), [from, to] = this.records(this.focus);
+    const xs = this.abscissa(this.focus),
+      [from, to] = this.records(this.focus);
     let best = from;
     for (let i = from; i <= to; i++) if (Math.abs(xs[i] - x) < Math.abs(xs[best] - x)) best = i;
     this.onSeek(this.focus.series.time[best]);

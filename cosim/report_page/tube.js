@@ -29,7 +29,7 @@ bool near() {
 const GLASS_FRAGMENT = `${TUBE_COMMON}
 void main() {
   float rim = 1.0 - facing();
-  gl_FragColor = vec4(ink, strength * (0.10 + 0.62 * rim * rim * rim));
+  gl_FragColor = vec4(ink, strength * (0.07 + 0.60 * rim * rim * rim));
   #include <colorspace_fragment>
 }`;
 
@@ -53,16 +53,33 @@ class TubeView {
     geometry.computeBoundingSphere();
     this.sphere = geometry.boundingSphere;
     this.uniforms = {
-      ink: { value: new THREE.Color() }, ground: { value: new THREE.Color() },
-      strength: { value: 1 }, fog: { value: 0 }, cut: { value: 0 },
+      ink: { value: new THREE.Color() },
+      ground: { value: new THREE.Color() },
+      strength: { value: 1 },
+      fog: { value: 0 },
+      cut: { value: 0 },
     };
     const shared = { uniforms: this.uniforms, vertexShader: TUBE_VERTEX, side: THREE.DoubleSide };
-    this.glass = new THREE.Mesh(geometry, new THREE.ShaderMaterial({
-      ...shared, fragmentShader: GLASS_FRAGMENT, transparent: true, depthWrite: false,
-    }));
-    this.shell = new THREE.Mesh(geometry, new THREE.ShaderMaterial({
-      ...shared, fragmentShader: SHELL_FRAGMENT, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1,
-    }));
+    this.glass = new THREE.Mesh(
+      geometry,
+      new THREE.ShaderMaterial({
+        ...shared,
+        fragmentShader: GLASS_FRAGMENT,
+        transparent: true,
+        depthWrite: false,
+        forceSinglePass: true,
+      }),
+    );
+    this.shell = new THREE.Mesh(
+      geometry,
+      new THREE.ShaderMaterial({
+        ...shared,
+        fragmentShader: SHELL_FRAGMENT,
+        polygonOffset: true,
+        polygonOffsetFactor: 1,
+        polygonOffsetUnits: 1,
+      }),
+    );
     this.glass.renderOrder = 10;
     this.group = new THREE.Group();
     this.group.add(this.shell, this.glass);

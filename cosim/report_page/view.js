@@ -3,68 +3,29 @@
 const UP = new THREE.Vector3(0, 0, 1);
 const LAYERS = { path: "path", axis: "centreline", rays: "LiDAR", cone: "camera", target: "target" };
 const FOLLOW_DISTANCE = 5; // over R
-const SPOT = `
-uniform vec3 colour;
-uniform float size, ring;
-void main() {
-  float r = length(gl_PointCoord - 0.5) * 2.0;
-  float edge = 2.0 / size;
-  float alpha = 1.0 - smoothstep(1.0 - edge, 1.0, r);
-  if (ring > 0.5) alpha *= smoothstep(0.55 - edge, 0.55, r) + smoothstep(0.40, 0.40 - edge, r);
-  if (alpha < 0.02) discard;
-  gl_FragColor = vec4(colour, alpha);
-  #include <colorspace_fragment>
-}`;
-
-/** Round points of a size in pixels, which no distance makes smaller. */
-function spots(count, size, ring = false) {
-  const geometry = new THREE.BufferGeometry();
-  geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(3 * count), 3));
-  const pixels = size * Math.min(window.devicePixelRatio, 2);
-  const material = new THREE.ShaderMaterial({
-    uniforms: { colour: { value: new THREE.Color() }, size: { value: pixels }, ring: { value: ring ? 1 : 0 } },
-    vertexShader: `uniform float size; void main() {
-      gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); gl_PointSize = size; }`,
-    fragmentShader: SPOT, transparent: true, depthWrite: false,
-  });
-  const points = new THREE.Points(geometry, material);
-  points.frustumCulled = false;
-  return points;
+const REST = 350; // ms
+const FILLED = 0.84; // of the view, by the tube
+/** Whether a GPU draws; else the processor does, and smooth edges would cost most of its time. */
+function drawnByGpu() {
+  return !!document.createElement("canvas").getContext("webgl2", { failIfMajorPerformanceCaveat: true });
 }
 
-/** Thin lines between pairs of points that move. */
-function segments(count, opacity) {
-  const geometry = new THREE.BufferGeometry();
-  geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(6 * count), 3));
-  const material = new THREE.LineBasicMaterial({ transparent: true, opacity, depthWrite: false });
-  const lines = new THREE.LineSegments(geometry, material);
-  lines.frustumCulled = false;
-  return lines;
-}
-
-/** A line of a width in pixels along points (3 N), with a colour a point where `colours` is given. */
-function ribbon(points, width, opacity, colours = null) {
-  const count = Math.max(points.length / 3 - 1, 1);
-  const pairs = (values) => {
-    const out = new Float32Array(6 * count);
-    for (let i = 0; i < count; i++) {
-      const next = Math.min(3 * i + 3, values.length - 3);
-      out.set(values.subarray(3 * i, 3 * i + 3), 6 * i);
-      out.set(values.subarray(next, next + 3), 6 * i + 3);
-    }
-    return out;
-  };
-  const geometry = new THREE.LineSegmentsGeometry();
-  geometry.setPositions(pairs(points));
-  if (colours) geometry.setColors(pairs(colours));
-  const material = new THREE.LineMaterial({ linewidth: width, transparent: opacity < 1, opacity, vertexColors: !!colours });
-  const line = new THREE.LineSegments2(geometry, material);
-  line.frustumCulled = false;
-  return line;
-}
-
-function vectorAt(array, i, into) {
-  return into.set(array[3 * i], array[3 * i + 1], array[3 * i + 2]);
+/** The horizontal direction across the main course of points (3 N). */
+function broadside(points) {
+  let [x, y, xx, yy, xy] = [0, 0, 0, 0, 0];
+  const count = points.length / 3;
+  for (let i = 0; i < points.length; i += 3) {
+    x += points[i] / count;
+    y += points[i + 1] / count;
+  }
+  for (let i = 0; i < points.length; i += 3) {
+    const [a, b] = [points[i] - x, points[i + 1] - y];
+    xx += a * a;
+    yy += b * b;
+    xy += a * b;
+  }
+  const angle = 0.5 * Math.atan2(2 * xy, xx - yy);
+  return new THREE.Vector3(Math.sin(angle), -Math.cos(angle), 0);
 }
 
 /** One run in the view: its path and its drone. */
@@ -76,8 +37,10 @@ class RunView {
     shape.setAttribute("position", new THREE.BufferAttribute(run.drone.vertices, 3));
     shape.setIndex(new THREE.BufferAttribute(run.drone.faces, 1));
     shape.computeVertexNormals();
-    this.drone = new THREE.Mesh(shape, new THREE.MeshStandardMaterial({ roughness: 0.55, metalness: 0.0 }));
-    this.spot = spots(1, 15, true);
+    this.drone = new THREE.Mesh(shape, new THREE.MeshLambertMaterial());
+    this.spot = spots(1, 17, true);
+    this.spot.material.depthTest = false; // where the drone is must be seen from everywhere
+    this.spot.renderOrder = 30;
     this.group.add(this.drone, this.spot);
     this.path = this.ghost = null;
     this._next = new THREE.Vector3();
@@ -93,7 +56,7 @@ class RunView {
       line.material.dispose();
     }
     this.path = ribbon(this.run.series.position, 3.5, 1, colours);
-    this.ghost = ribbon(this.run.series.position, 2, 0.35, colours);
+    this.ghost = still(this.run.series.position, 2, 0.6, colours);
     this.group.add(this.ghost, this.path);
   }
 
@@ -111,111 +74,17 @@ class RunView {
   }
 }
 
-/** What the drone in focus senses: LiDAR, the camera's pyramid, target and memory. */
-class SensesView {
-  constructor(rays) {
-    this.rays = segments(2 * rays, 0.5);
-    this.hits = spots(2 * rays, 4);
-    this.cone = segments(8, 0.85);
-    this.sight = segments(1, 0.9);
-    this.target = spots(1, 13);
-    this.memory = ribbon(new Float32Array(6), 4, 1);
-    this.group = new THREE.Group();
-    this.group.add(this.rays, this.hits, this.cone, this.sight, this.target, this.memory);
-    this.axes = [new THREE.Vector3(), new THREE.Vector3(), new THREE.Vector3()];
-  }
-
-  paint() {
-    const set = (object, name) => (object.material.uniforms?.colour?.value ?? object.material.color).set(cssColour(name));
-    set(this.rays, "--ray");
-    set(this.hits, "--ray");
-    set(this.cone, "--cone");
-    set(this.memory, "--memory");
-    this.seen = new THREE.Color(cssColour("--good"));
-    this.unseen = new THREE.Color(cssColour("--faint"));
-  }
-
-  /** Show what `run` senses at a record with its drone at this place. */
-  update(run, record, drone, layers) {
-    const [forward, up, right] = this.axes;
-    forward.set(1, 0, 0).applyQuaternion(drone.quaternion);
-    up.set(0, 0, 1).applyQuaternion(drone.quaternion);
-    right.crossVectors(forward, up);
-    this.rays.visible = this.hits.visible = layers.rays;
-    if (layers.rays) this._scan(run, record, drone.position);
-    this.cone.visible = layers.cone;
-    if (layers.cone) this._pyramid(run, record, drone.position);
-    this._aim(run, record, drone.position, layers.target);
-  }
-
-  _scan(run, record, centre) {
-    const { rays, offset, reach } = run.lidar, [forward, up, right] = this.axes;
-    const lines = this.rays.geometry.attributes.position, ends = this.hits.geometry.attributes.position;
-    for (let ring = 0; ring < 2; ring++) {
-      for (let j = 0; j < rays; j++) {
-        const n = ring * rays + j, phi = (2 * Math.PI * j) / rays, c = Math.cos(phi), s = Math.sin(phi);
-        const length = (run.series.lidar[2 * rays * record + n] / 255) * reach, ahead = ring ? -offset : offset;
-        const start = [0, 0, 0], end = [0, 0, 0];
-        ["x", "y", "z"].forEach((axis, i) => {
-          start[i] = centre[axis] + ahead * forward[axis];
-          end[i] = start[i] + length * (c * right[axis] + s * up[axis]);
-        });
-        lines.setXYZ(2 * n, ...start);
-        lines.setXYZ(2 * n + 1, ...end);
-        ends.setXYZ(n, ...end);
-      }
-    }
-    lines.needsUpdate = ends.needsUpdate = true;
-  }
-
-  _pyramid(run, record, centre) {
-    const { half_width, half_height, field_of_view } = run.camera, [forward, up, right] = this.axes;
-    const length = 0.9 * run.series.radius[record];
-    const wide = length * Math.tan(half_width * field_of_view), high = length * Math.tan(half_height * field_of_view);
-    const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([x, y]) =>
-      centre.clone().addScaledVector(forward, length).addScaledVector(right, x * wide).addScaledVector(up, y * high));
-    const place = this.cone.geometry.attributes.position;
-    corners.forEach((corner, i) => {
-      const after = corners[(i + 1) % 4];
-      place.setXYZ(4 * i, centre.x, centre.y, centre.z);
-      place.setXYZ(4 * i + 1, corner.x, corner.y, corner.z);
-      place.setXYZ(4 * i + 2, corner.x, corner.y, corner.z);
-      place.setXYZ(4 * i + 3, after.x, after.y, after.z);
-    });
-    place.needsUpdate = true;
-  }
-
-  _aim(run, record, centre, shown) {
-    const { target_visible, target_position, memory_available, memory_direction, radius } = run.series;
-    const seen = target_visible[record] > 0, point = vectorAt(target_position, record, new THREE.Vector3());
-    this.target.visible = shown;
-    this.sight.visible = shown && seen;
-    this.memory.visible = shown && !seen && memory_available[record] > 0;
-    this.target.position.copy(point);
-    this.target.material.uniforms.colour.value.copy(seen ? this.seen : this.unseen);
-    this.target.material.uniforms.ring.value = seen ? 0 : 1;
-    this.sight.material.color.copy(this.seen);
-    const place = this.sight.geometry.attributes.position;
-    place.setXYZ(0, centre.x, centre.y, centre.z);
-    place.setXYZ(1, point.x, point.y, point.z);
-    place.needsUpdate = true;
-    if (this.memory.visible) {
-      const tip = vectorAt(memory_direction, record, point).multiplyScalar(1.4 * radius[record]).add(centre);
-      this.memory.geometry.setPositions([centre.x, centre.y, centre.z, tip.x, tip.y, tip.z]);
-    }
-  }
-}
-
 /** All of the scene; draws itself when something changed, and rests otherwise. */
 class View {
   constructor(data, canvas) {
     this.data = data;
     this.canvas = canvas;
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
-    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
+    this.quick = drawnByGpu();
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: this.quick, alpha: true });
+    this.ratio = Math.min(window.devicePixelRatio, 2);
     this.scene = new THREE.Scene();
     this.tubes = data.tubes.map((tube) => new TubeView(tube));
-    this.axes = data.tubes.map((tube) => ribbon(tube.axis, 1.5, 0.8));
+    this.axes = data.tubes.map((tube) => still(tube.axis, 1.5, 0.8));
     this.runs = data.runs.map((run) => new RunView(run));
     this.senses = new SensesView(Math.max(...data.runs.map((run) => run.lidar.rays)));
     this.scene.add(this.senses.group, new THREE.HemisphereLight(0xffffff, 0x888888, 2.2));
@@ -259,10 +128,16 @@ class View {
   choose(focus, visible) {
     this.focus = focus;
     this.visible = visible;
-    this.runs.forEach((view) => { view.group.visible = visible.has(view.run); });
+    this.runs.forEach((view) => {
+      view.group.visible = visible.has(view.run);
+    });
     const seen = new Set([...visible].map((run) => run.tube));
-    this.tubes.forEach((tube, i) => { tube.group.visible = seen.has(i); });
-    this.axes.forEach((axis, i) => { axis.visible = this.layers.axis && seen.has(i); });
+    this.tubes.forEach((tube, i) => {
+      tube.group.visible = seen.has(i);
+    });
+    this.axes.forEach((axis, i) => {
+      axis.visible = this.layers.axis && seen.has(i);
+    });
     this.redraw();
   }
 
@@ -281,14 +156,15 @@ class View {
   /** Look at the whole tube, follow the drone in focus, or look out of it. */
   setCamera(mode) {
     this.cameraMode = mode;
-    const camera = this.camera, drone = this.runs[this.focus.number].drone;
+    const camera = this.camera,
+      drone = this.runs[this.focus.number].drone;
     this.controls.enabled = mode !== "aboard";
     camera.fov = mode === "aboard" ? 80 : 50;
     camera.near = mode === "overview" ? 0.05 * this.radius : 0.02 * this.radius;
     if (mode === "overview") this._fit();
     else if (mode === "follow") {
       this.heading = this._yaw(recordAt(this.focus, this.time).record);
-      const back = new THREE.Vector3(-0.86, -0.42, 0.40).multiplyScalar(FOLLOW_DISTANCE * this.radius);
+      const back = new THREE.Vector3(-0.86, -0.42, 0.4).multiplyScalar(FOLLOW_DISTANCE * this.radius);
       camera.position.copy(drone.position).add(back.applyAxisAngle(UP, this.heading));
       this.controls.target.copy(drone.position);
     }
@@ -299,22 +175,50 @@ class View {
     if (this.controls.enabled) this.controls.update();
   }
 
-  /** Stand where the whole of the focus's tube is seen, from the side on which it looks longest. */
+  /** Stand where the whole tube of the focus fills the view, on the side from which the way looks longest. */
   _fit() {
-    const { center, radius } = this.tubes[this.focus.tube].sphere, camera = this.camera;
-    const points = this.data.tubes[this.focus.tube].axis;
-    const along = new THREE.Vector3(points.at(-3) - points[0], points.at(-2) - points[1], 0);
-    const side = along.lengthSq() > 1e-9 ? along.normalize().cross(UP) : new THREE.Vector3(0, -1, 0);
-    const half = (camera.fov * Math.PI) / 360, narrow = Math.min(1, camera.aspect);
-    const away = (0.86 * radius) / Math.tan(half) / Math.max(narrow, 0.55);
-    camera.position.copy(center).addScaledVector(side, away * 0.85).addScaledVector(UP, away * 0.5);
+    const { camera } = this,
+      { vertices, axis } = this.data.tubes[this.focus.tube];
+    const { center, radius } = this.tubes[this.focus.tube].sphere,
+      target = center.clone();
+    const back = broadside(axis).multiplyScalar(0.85).addScaledVector(UP, 0.5).normalize();
+    const tall = Math.tan((camera.fov * Math.PI) / 360),
+      wide = tall * camera.aspect;
+    const place = new THREE.Vector3(),
+      every = 3 * Math.ceil(vertices.length / 30000);
+    let away = radius / Math.min(tall, wide);
+    for (let round = 0; round < 4; round++) {
+      camera.position.copy(target).addScaledVector(back, away);
+      camera.lookAt(target);
+      camera.updateMatrixWorld();
+      const low = new THREE.Vector2(Infinity, Infinity),
+        high = new THREE.Vector2(-Infinity, -Infinity);
+      for (let i = 0; i < vertices.length; i += every) {
+        place.fromArray(vertices, i).applyMatrix4(camera.matrixWorldInverse);
+        const at = new THREE.Vector2(-place.x / place.z / wide, -place.y / place.z / tall);
+        low.min(at);
+        high.max(at);
+      }
+      const middle = low
+          .clone()
+          .add(high)
+          .multiplyScalar(0.5 * away),
+        size = high.sub(low);
+      const [x, y] = [new THREE.Vector3(), new THREE.Vector3()];
+      camera.matrixWorld.extractBasis(x, y, place);
+      target.addScaledVector(x, middle.x * wide).addScaledVector(y, middle.y * tall);
+      away *= Math.max(size.x, size.y) / (2 * FILLED);
+    }
+    camera.position.copy(target).addScaledVector(back, away);
     camera.far = 20 * radius + 10;
-    this.controls.target.copy(center);
+    this.controls.target.copy(target);
   }
 
   /** Heading of the axis in the horizontal plane at a record of the focus; the last one where it stands upright. */
   _yaw(record) {
-    const t = this.focus.series.tangent, x = t[3 * record], y = t[3 * record + 1];
+    const t = this.focus.series.tangent,
+      x = t[3 * record],
+      y = t[3 * record + 1];
     return Math.hypot(x, y) > 0.25 ? Math.atan2(y, x) : (this.heading ?? 0);
   }
 
@@ -326,13 +230,15 @@ class View {
       view.place(record, part);
       view.path.visible &&= this.layers.path;
       view.ghost.visible = this.layers.path;
-      view.drone.visible = view.spot.visible = !(this.cameraMode === "aboard" && view.run === this.focus);
+      view.drone.visible = !(this.cameraMode === "aboard" && view.run === this.focus);
     }
-    const { record } = recordAt(this.focus, time), drone = this.runs[this.focus.number].drone;
+    const { record } = recordAt(this.focus, time),
+      drone = this.runs[this.focus.number].drone;
     const aboard = this.cameraMode === "aboard";
     this.senses.update(this.focus, record, drone, aboard ? { ...this.layers, cone: false, rays: false } : this.layers);
     if (this.cameraMode === "follow") {
-      const turned = this._yaw(record), offset = this.camera.position.clone().sub(this.controls.target);
+      const turned = this._yaw(record),
+        offset = this.camera.position.clone().sub(this.controls.target);
       offset.applyAxisAngle(UP, turned - this.heading);
       this.heading = turned;
       this.controls.target.copy(drone.position);
@@ -351,16 +257,39 @@ class View {
   resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
     if (!width || !height) return;
-    this.renderer.setSize(width, height, false);
+    this._size(this.ratio);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
     this.redraw();
   }
 
+  _size(ratio) {
+    const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
+    this.renderer.setPixelRatio(ratio);
+    this.renderer.setSize(width, height, false);
+  }
+
+  /** Draw with the next frame. Without a GPU edges are smoothed only once nothing has moved for a while. */
   redraw() {
     this.asked ??= requestAnimationFrame(() => {
       this.asked = undefined;
+      if (this.smooth) this._size(this.ratio);
+      this.smooth = false;
+      for (const view of this.runs) {
+        // near by, the drone needs no ring to be found
+        view.spot.visible =
+          view.drone.visible &&
+          this.camera.position.distanceTo(view.drone.position) > 2 * FOLLOW_DISTANCE * this.radius;
+      }
       this.renderer.render(this.scene, this.camera);
+      clearTimeout(this.resting);
+      if (!this.quick) this.resting = setTimeout(() => this._smooth(), REST);
     });
+  }
+
+  _smooth() {
+    this.smooth = true;
+    this._size(2 * this.ratio);
+    this.renderer.render(this.scene, this.camera);
   }
 }
