@@ -1,0 +1,293 @@
+"""The page of `cosim report` in a real browser: headless Chromium, from disk."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flights import Done
+from pages import PATIENCE, Browser, copy_run, evaluation_results, missing_browser, open_browser
+
+from cosim.recording import LOG, MANIFEST
+from cosim.report import report
+from cosim.runs import Run, read_run
+
+pytestmark = pytest.mark.skipif(bool(missing_browser()), reason=missing_browser())
+
+SHIFT = 0.125
+"""How far the second run of an overlay flew beside the first (m)."""
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """One browser for all pages."""
+    pytest.importorskip("selenium", reason="selenium is not installed: pip install selenium")
+    with open_browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def run(conduit_run: tuple[Done, Path]) -> Run:
+    """The flight through the conduit."""
+    return read_run(conduit_run[1])
+
+
+@pytest.fixture(scope="module")
+def page(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its page."""
+    return report([run.folder], tmp_path_factory.mktemp("page") / "page.html")
+
+
+@pytest.fixture
+def opened(browser: Browser, page: Path) -> Browser:
+    """The browser with the page of one run."""
+    browser.open(page)
+    return browser
+
+
+def places(browser: Browser) -> np.ndarray[Any, Any]:
+    """Where the drones stand in the view, (R, 3) in metres."""
+    return np.array(browser.run("return report.state().positions"))
+
+
+def assert_at(run: Run, record: int, place: np.ndarray[Any, Any]) -> None:
+    """The drone stands where the record says, to the page's single precision."""
+    np.testing.assert_allclose(place, run.records["position"][record], atol=1e-5)
+
+
+def test_it_opens_from_disk_and_asks_for_nothing(opened: Browser, page: Path) -> None:
+    """No error and no warning on the console, and the page itself is the only thing that is loaded."""
+    assert opened.complaints() == []
+    assert opened.requests() == [page.resolve().as_uri()]
+    assert opened.run("return document.body.innerText.includes('Success')")
+
+
+def test_the_slider_moves_the_drone(opened: Browser, run: Run) -> None:
+    """Keys on the slider go step by step, and wherever it is put the drone stands where it was recorded."""
+    from selenium.webdriver.common.keys import Keys
+
+    slider = opened.driver.find_element("id", "slider")
+    assert int(slider.get_attribute("max")) == len(run.records) - 1
+    slider.send_keys(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT)
+    assert opened.run("return report.state().record") == 3
+    assert_at(run, 3, places(opened)[0])
+    for record in (len(run.records) - 1, 200, 0):
+        opened.run(
+            f"const s = document.getElementById('slider'); s.value = {record}; s.dispatchEvent(new Event('input'))"
+        )
+        assert_at(run, record, places(opened)[0])
+
+
+def test_play_and_step(opened: Browser, run: Run) -> None:
+    """Space plays and pauses, which rests on a recorded step; the buttons go one step back and forth."""
+    from selenium.webdriver.common.keys import Keys
+
+    body = opened.driver.find_element("tag name", "body")
+    body.send_keys(Keys.SPACE)
+    deadline = time.monotonic() + PATIENCE
+    while opened.run("return report.state().record") < 5:
+        assert time.monotonic() < deadline
+    assert opened.run("return report.state().playing")
+    body.send_keys(Keys.SPACE)
+    assert not opened.run("return report.state().playing")
+    record = opened.run("return report.state().record")
+    assert_at(run, record, places(opened)[0])
+    opened.driver.find_element("id", "forward").click()
+    opened.driver.find_element("id", "forward").click()
+    opened.driver.find_element("id", "back").click()
+    assert opened.run("return report.state().record") == record + 1
+    assert_at(run, record + 1, places(opened)[0])
+
+
+def test_something_is_drawn(opened: Browser) -> None:
+    """Tube, path and drone colour a good part of the view, whose background is transparent; without a tube, less."""
+    count = """
+        const { view } = report, gl = view.renderer.getContext();
+        const drawn = () => {
+            view.renderer.render(view.scene, view.camera);
+            const pixels = new Uint8Array(4 * gl.drawingBufferWidth * gl.drawingBufferHeight);
+            gl.readPixels(0, 0, gl.drawingBufferWidth, gl.drawingBufferHeight, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+            return pixels.filter((value, i) => i % 4 === 3 && value > 0).length / (pixels.length / 4);
+        };
+        const shares = [];
+        for (const tube of ['glass', 'cut', 'whole', 'off']) { view.setTube(tube); shares.push(drawn()); }
+        return shares;
+    """
+    glass, cut, whole, off = opened.run(count)
+    assert min(glass, cut, whole) > 0.05
+    assert 0.0 < off < 0.5 * glass
+
+
+def test_the_camera_follows_the_drone_and_looks_out_of_it(opened: Browser, run: Run) -> None:
+    """Following, it keeps its distance and looks at the drone; on board, it stands in the drone's place."""
+    distance = (
+        "const { view } = report; const d = view.runs[0].drone.position;"
+        "return [view.camera.position.distanceTo(d), view.controls.target.distanceTo(d)]"
+    )
+    opened.run("report.view.setCamera('follow'); report.player.seekRecord(10)")
+    before, _ = opened.run(distance)
+    opened.run("report.player.seekRecord(250)")
+    after, off_target = opened.run(distance)
+    assert after == pytest.approx(before, rel=1e-3)
+    assert off_target == pytest.approx(0.0, abs=1e-6)
+    opened.run("report.view.setCamera('aboard')")
+    assert_at(run, 250, np.array(opened.run("return report.view.camera.position.toArray()")))
+
+
+def test_scans_end_on_the_wall(opened: Browser, run: Run) -> None:
+    """The ends of the drawn LiDAR rays are as far from the axis as the tube is wide, give or take its fittings."""
+    opened.run("report.player.seekRecord(30)")
+    ends = np.array(
+        opened.run("return Array.from(report.view.senses.hits.geometry.attributes.position.array)")
+    ).reshape(-1, 3)
+    record = run.records[30]
+    away = ends - record["axis_position"]
+    away -= np.outer(away @ record["tangent"], record["tangent"])
+    np.testing.assert_allclose(np.linalg.norm(away, axis=1), record["radius"], rtol=0.15)
+
+
+def test_every_chart_has_its_curves_and_the_cursor_goes_along(opened: Browser) -> None:
+    """Ten charts with at least one curve or band each; the cursor moves with the slider, a click moves the slider."""
+    charts = opened.run(
+        "return [...document.querySelectorAll('.chart')].map((chart) => [chart.id,"
+        "[...chart.querySelectorAll('path.curve')].filter((path) => path.getAttribute('d').length > 50).length"
+        "+ chart.querySelectorAll('rect.regime').length])"
+    )
+    assert len(charts) == 10
+    assert all(count > 0 for _, count in charts), charts
+    at = "return +document.querySelector('#chart-clearance .cursor line').getAttribute('x1')"
+    first = opened.run(at)
+    opened.run("report.player.seekRecord(200)")
+    assert opened.run(at) > first + 50
+    chart = opened.driver.find_element("css selector", "#chart-speed svg")
+    chart.click()  # in its middle
+    middle = opened.run("return report.state().record / report.runs[0].count")
+    assert middle == pytest.approx(0.5, abs=0.06)
+
+
+def test_curves_are_drawn_by_arc_length_and_over_a_span_too(opened: Browser) -> None:
+    """Both change what the charts show; the arc length's axis ends with metres."""
+    shape = "return document.querySelector('#chart-clearance path.curve').getAttribute('d')"
+    by_time = opened.run(shape)
+    opened.driver.find_element("css selector", "#abscissa button[value=arc_length]").click()
+    by_arc = opened.run(shape)
+    assert by_arc != by_time
+    assert opened.run(
+        "return [...document.querySelectorAll('#chart-clearance .tick.x')].pop().textContent"
+    ).endswith("m")
+    opened.run("report.plots.span = 5; report.player.seekRecord(200)")
+    assert opened.run(shape) not in (by_time, by_arc)
+    assert opened.complaints() == []
+
+
+@pytest.fixture(scope="module")
+def overlay(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A page of the run, and of one that flew beside it and collided; the one failure of an evaluation."""
+    folder = tmp_path_factory.mktemp("overlay")
+    beside = copy_run(run.folder, folder / "beside", records=60)
+    records = np.frombuffer(
+        bytearray((beside / LOG).read_bytes())[: 60 * run.records.itemsize], run.records.dtype
+    )
+    records["position"] += [0.0, 0.0, SHIFT]
+    records["outcome"][-1] = 3
+    (beside / LOG).write_bytes(records.tobytes())
+    manifest = json.loads((beside / MANIFEST).read_text())
+    manifest["tube"] = {"level": 2, "seed": 7}
+    manifest["policy"]["name"] = "lidar-rule"
+    (beside / MANIFEST).write_text(json.dumps(manifest))
+    results = evaluation_results()
+    results["flown"][1]["steps"] = 59
+    (folder / "results.json").write_text(json.dumps(results))
+    return report([folder / "results.json", run.folder, beside], folder / "page.html")
+
+
+def test_several_runs_are_overlaid(browser: Browser, overlay: Path, run: Run) -> None:
+    """Both drones stand where they were at the same time, both have a curve, and a tick hides one of them."""
+    browser.open(overlay)
+    browser.run("report.player.seekRecord(40)")
+    first, second = places(browser)
+    assert_at(run, 40, first)
+    np.testing.assert_allclose(second - first, [0.0, 0.0, SHIFT], atol=1e-5)
+    curves = "return document.querySelectorAll('#chart-curvature path.curve').length"
+    assert browser.run(curves) == 2
+    browser.driver.find_elements("css selector", "#runs input")[1].click()
+    assert browser.run(curves) == 1
+    assert browser.run("return report.view.runs.map((view) => view.group.visible)") == [True, False]
+    assert browser.complaints() == []
+
+
+def test_a_failure_is_linked_to_its_replay(browser: Browser, overlay: Path, run: Run) -> None:
+    """The failure's row has the command that flies it again, and a link that goes to the end of its run."""
+    browser.open(overlay)
+    row = browser.driver.find_element("css selector", "#evaluations table:last-of-type a").find_element(
+        "xpath", "ancestor::tr"
+    )
+    assert "cosim launch --tube level=2,seed=7" in row.text
+    row.find_element("tag name", "a").click()
+    state = browser.run("return report.state()")
+    assert (state["focus"], state["record"]) == (1, 59)
+    np.testing.assert_allclose(
+        state["positions"][1], run.records["position"][59] + [0.0, 0.0, SHIFT], atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("which", ["page", "overlay"])
+def test_it_fits_a_phone(browser: Browser, which: str, request: pytest.FixtureRequest) -> None:
+    """In a window of 390 pixels nothing is wider than the window, and slider and play can be reached."""
+    browser.open(request.getfixturevalue(which), width=390, height=844)
+    assert browser.run("return document.documentElement.scrollWidth") == 390
+    for name in ("slider", "play"):
+        box = browser.run(f"return document.getElementById('{name}').getBoundingClientRect().toJSON()")
+        assert box["left"] >= 0
+        assert box["right"] <= 390
+        assert box["width"] >= 34
+
+
+def test_dark_mode_changes_page_and_view(browser: Browser, page: Path) -> None:
+    """Dark ground and light text where the system is dark, in the 3-D view as well; also while it is open."""
+    colours = (
+        "await new Promise(requestAnimationFrame); await new Promise(requestAnimationFrame);"
+        "const brightness = (text) => text.match(/[\\d.]+/g).slice(0, 3).reduce((a, b) => a + +b, 0) / 3;"
+        "const style = getComputedStyle(document.documentElement), ink = report.view.tubes[0].uniforms.ink.value;"
+        "return [brightness(style.backgroundColor), brightness(style.color), ink.r + ink.g + ink.b]"
+    )
+    browser.open(page)
+    ground, text, ink = browser.run(colours)
+    assert ground > 200 > 100 > text
+    scheme = [{"name": "prefers-color-scheme", "value": "dark"}]
+    browser.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
+    dark_ground, dark_text, dark_ink = browser.run(colours)
+    assert dark_ground < 60 < 200 < dark_text
+    assert dark_ink > ink
+    browser.open(page, dark=True)
+    assert browser.run(colours) == [dark_ground, dark_text, dark_ink]
+
+
+def test_a_run_of_one_record_is_shown(browser: Browser, run: Run, tmp_path: Path) -> None:
+    """A flight that was cut short before its first step still has a page, without an error."""
+    short = copy_run(run.folder, tmp_path / "run", records=1)
+    browser.open(report([short]))
+    assert browser.complaints() == []
+    assert_at(run, 0, places(browser)[0])
+    assert "Cut short" in browser.run("return document.getElementById('headline').innerText")
+
+
+def test_it_does_without_webgl(browser: Browser, page: Path, tmp_path: Path) -> None:
+    """Where the browser has no WebGL the page says so, and everything but the view works."""
+    blind = tmp_path / "blind.html"
+    blind.write_text(
+        page.read_text().replace(
+            '<script type="module">',
+            '<script type="module">HTMLCanvasElement.prototype.getContext = () => null;',
+            1,
+        )
+    )
+    browser.open(blind)
+    assert "no WebGL" in browser.run("return document.getElementById('no-view').textContent")
+    browser.run("report.player.seekRecord(100)")
+    assert browser.run("return document.querySelectorAll('path.curve').length") > 10
