@@ -30,6 +30,8 @@ LEAST_STEPS = 200
 """Steps that a short tube has at least."""
 LENGTHS = (1e-3, 1e5)
 """Shortest and longest centreline (m): what lies outside is a wrong unit, not a tube."""
+TRIAL_EXTENT = 100.0
+"""Diagonal of the bounding box (m) at which a tube is measured that is to become so wide."""
 RING = 36
 """Rays over which the local radius is the mean."""
 LEAST_HITS = RING // 2 + 1
@@ -111,9 +113,39 @@ def read_tube(
             or leaves the tube.
     """
     if isinstance(scale, MeanRadius):
-        unscaled = read_tube(mesh, centreline, axes, None, start_end, entry, exit)
-        return _rescale(unscaled, scale, centreline, start_end)
-    wall = read_wall(mesh, axes, scale)
+        return _read_as_wide(mesh, scale.metres, centreline, axes, start_end, entry, exit)
+    return _tube_in(read_wall(mesh, axes, scale), centreline, start_end, entry, exit)
+
+
+def _read_as_wide(
+    mesh: str | Path,
+    radius: float,
+    centreline: str | Path | None,
+    axes: AxesChoice,
+    start_end: Literal["first", "last"],
+    entry: ArrayLike | None,
+    exit: ArrayLike | None,
+) -> Tube:
+    """Read a tube at the scale at which its mean radius is as wanted (m), whatever its unit."""
+    from meshes.sections import mean_radius
+
+    wall = read_wall(mesh, axes)
+    extent = float(np.linalg.norm(np.ptp(wall.vertices, axis=0))) or 1.0
+    tube = _tube_in(wall.rescaled(wall.scale * TRIAL_EXTENT / extent), centreline, start_end, entry, exit)
+    factor = radius / mean_radius(tube.wall.scene, tube.axis, tube.tangent)
+    metres = tube.scale * factor
+    if tube.found is None:
+        return read_tube(mesh, centreline, tube.axes, metres, start_end)
+    return _tube_of_found(tube.wall.rescaled(metres), tube.found.scaled(factor), start_end)
+
+
+def _tube_in(
+    wall: Wall,
+    centreline: str | Path | None,
+    start_end: Literal["first", "last"],
+    entry: ArrayLike | None,
+    exit: ArrayLike | None,
+) -> Tube:
     path = None if entry is not None or exit is not None else _find_centreline_file(wall.path, centreline)
     if path is None:
         return _tube_of_found(wall, _find(wall, entry, exit), start_end)
@@ -138,21 +170,6 @@ def _find(wall: Wall, entry: ArrayLike | None, exit: ArrayLike | None) -> FoundC
 def _tube_of_found(wall: Wall, found: FoundCentreline, start_end: Literal["first", "last"]) -> Tube:
     sha256 = hashlib.sha256(np.ascontiguousarray(wall.to_file(found.points)).tobytes()).hexdigest()
     return replace(_tube(wall, found.points, None, sha256, start_end), found=found)
-
-
-def _rescale(
-    tube: Tube, scale: MeanRadius, centreline: str | Path | None, start_end: Literal["first", "last"]
-) -> Tube:
-    """The tube at the scale at which its mean radius is as wanted."""
-    from meshes.sections import mean_radius
-
-    if not (np.isfinite(scale.metres) and scale.metres > 0.0):
-        raise CentrelineError(f"scale: expected a mean radius above 0 m, found {scale.metres}")
-    factor = scale.metres / mean_radius(tube.wall.scene, tube.axis, tube.tangent)
-    metres = tube.scale * factor
-    if tube.found is None:
-        return read_tube(tube.path, centreline, tube.axes, metres, start_end)
-    return _tube_of_found(read_wall(tube.path, tube.axes, metres), tube.found.scaled(factor), start_end)
 
 
 def _tube(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Final
@@ -53,6 +53,10 @@ class Wall:
             x, y, z = points.T
             points = np.stack([x, z, -y], axis=1)
         return points / self.scale
+
+    def rescaled(self, scale: float) -> Wall:
+        """The same wall at another scale (metres a unit), equal to reading it so but for rounding."""
+        return replace(self, vertices=self.vertices * (scale / self.scale), scale=scale)
 
 
 def read_wall(path: str | Path, axes: AxesChoice = "auto", scale: float | None = None) -> Wall:
