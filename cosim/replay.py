@@ -50,7 +50,7 @@ def replay(
         if finding.step is None or finding.step <= from_step:
             raise RunError(f"{folder} is not as it was recorded: {finding}")
     tube, changed = find_tube(run, None)
-    if tube is None:
+    if tube is None or changed:
         raise RunError(f"{folder}: {changed[0]}")
     options = replace(options_of(run), policy=policy, lookahead=None, speed=None, out=out)
     if options.tube is None:
