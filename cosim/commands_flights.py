@@ -18,9 +18,13 @@ from cosim.screens import EXIT_NO_SUCCESS, command, json_option, option
 
 @command(cls=SettingsCommand, short_help="Fly a policy through a tube, physics in its own process.")
 @flight_options
+@option("--view", is_flag=True, help="Show it live in a window, at --realtime 1 unless told otherwise.")
+@click.option("--view-frames", type=click.Path(path_type=Path, exists=True, file_okay=False), hidden=True)
 @option("--require-success", is_flag=True, help="Exit 1 unless the outcome is success.")
 @json_option
-def launch(require_success: bool, as_json: bool, **options: Any) -> None:
+def launch(
+    view: bool, view_frames: Path | None, require_success: bool, as_json: bool, **options: Any
+) -> None:
     """Fly a policy through a tube in a separate physics process.
 
     \b
@@ -28,9 +32,11 @@ def launch(require_success: bool, as_json: bool, **options: Any) -> None:
     cosim launch --tube level=2,seed=1234 --hard
     """
     from cosim.launch import launch as run
+    from cosim.live_view import ViewChoice
 
     settings = take_settings(options)
-    report = run(FlightOptions(settings=settings, **options), as_json=as_json)
+    choice = ViewChoice(view_frames) if view or view_frames is not None else None
+    report = run(FlightOptions(settings=settings, **options), as_json=as_json, view=choice)
     if require_success and report["outcome"] != "success":
         sys.exit(EXIT_NO_SUCCESS)
 

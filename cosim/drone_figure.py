@@ -47,7 +47,6 @@ class DroneFigure:
         walls: what ends its lines of sight.
         body_radius: of its body (m).
         colour: of its body.
-        senses: whether more than its body is drawn.
     """
 
     def __init__(
@@ -58,14 +57,10 @@ class DroneFigure:
         *,
         body_radius: float,
         colour: str,
-        senses: bool = True,
     ) -> None:
         self._sensors, self._walls, self._radius = sensors, walls, body_radius
         self._body = stage.surface(drone_surface(body_radius, rings=16, sides=32), colour)
         self._dot = stage.dot(colour, 10.0)
-        self._senses = senses
-        if not senses:
-            return
         rays, border = 2 * sensors.rays, 4 * _SIDES
         nowhere = np.zeros((2, 3))
         self._rays = stage.lines([nowhere] * rays, "#2678c8", 1.3)
@@ -78,7 +73,7 @@ class DroneFigure:
         self._edge = stage.lines([loop, *[nowhere] * 4], CAMERA_COLOUR, 1.6)
         self._target = stage.surface(_ball(0.5 * body_radius), TARGET_COLOUR)
         self._sight = stage.lines([nowhere], TARGET_COLOUR, 2.0)
-        self._memory = stage.surface(_arrow(), MEMORY_COLOUR)
+        self._memory = stage.surface(arrow(), MEMORY_COLOUR)
 
     def show(self, position: Floats, quaternion: Floats, readings: Floats | None, sighting: Sighting) -> None:
         """Show it at a pose.
@@ -93,8 +88,6 @@ class DroneFigure:
         forward, up, right = local_frames(places, turns)[0]
         self._body.place(position, np.stack([forward, -right, up], axis=1))
         self._dot.move(places)
-        if not self._senses:
-            return
         self._show_rays(places, turns, readings)
         self._show_camera(places, turns)
         self._target.show(sighting.target is not None)
@@ -105,7 +98,7 @@ class DroneFigure:
         self._memory.show(sighting.memory is not None)
         if sighting.memory is not None:
             length = 6.0 * self._radius
-            self._memory.place(position, length * _frame_along(sighting.memory))
+            self._memory.place(position, length * frame_along(sighting.memory))
 
     def _show_rays(self, places: Floats, turns: Floats, readings: Floats | None) -> None:
         origins, directions = (found[0] for found in lidar_rays(self._sensors, places, turns))
@@ -138,7 +131,7 @@ def _ball(radius: float) -> Surface:
     return Surface(vertices, surface.faces)
 
 
-def _arrow(sides: int = 12) -> Surface:
+def arrow(sides: int = 12) -> Surface:
     """An arrow from the origin along x, of length 1."""
     around = 2.0 * np.pi * np.arange(sides) / sides
     circle = np.stack([np.zeros(sides), np.cos(around), np.sin(around)], axis=1)
@@ -152,7 +145,7 @@ def _arrow(sides: int = 12) -> Surface:
     return Surface(vertices, np.concatenate(faces).astype(np.int32))
 
 
-def _frame_along(direction: Floats) -> Floats:
+def frame_along(direction: Floats) -> Floats:
     """A rotation (3, 3) whose first column is a unit direction (3,)."""
     least = np.eye(3)[int(np.argmin(np.abs(direction)))]
     side = np.cross(direction, least)

@@ -5,6 +5,7 @@
     ├── RunError                    2   a run folder that cannot be read
     ├── PeerCommandError            2   the physics command cannot be started
     ├── ViewError                   2   nothing can be drawn here
+    │   └── NoDisplayError          2   a window without a display
     └── WorkerError                     a worker process failed; 3, or the status of what it failed of
     protocol.errors.ProtocolError   3   the other process or the protocol failed
     ├── protocol.errors.SessionError    2   our own side asked for what cannot be had (no room, name in use)
@@ -45,6 +46,10 @@ class PeerCommandError(CosimError):
 
 class ViewError(CosimError):
     """A picture or window that cannot be made here; says what is missing and what to do."""
+
+
+class NoDisplayError(ViewError):
+    """A window without a display."""
 
 
 class WorkerError(CosimError):

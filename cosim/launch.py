@@ -8,7 +8,7 @@ import platform
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,6 +32,7 @@ from cosim.inputs import (
     setting_notes,
 )
 from cosim.live import LiveLine
+from cosim.live_view import LiveView, ViewChoice
 from cosim.options import SHIPPED_MESH, SHIPPED_POLICY, FlightOptions
 from cosim.pilots import SHIPPED_CHECKPOINT, Pilot, PilotChoice, Terms, choose_pilot, read_pilot
 from cosim.recording import MANIFEST, Recorder
@@ -83,13 +84,17 @@ class Continuation:
 
 
 def launch(
-    options: FlightOptions, *, as_json: bool = False, after: Continuation | None = None
+    options: FlightOptions,
+    *,
+    as_json: bool = False,
+    after: Continuation | None = None,
+    view: ViewChoice | None = None,
 ) -> dict[str, Any]:
     """Fly once, say what happened, and return the report that --json prints.
 
     The physics process starts up while the tube is read; bad input ends it and leaves nothing behind. With
     `as_json` stdout holds one JSON object and everything else goes to stderr. With `after` the
-    flight goes on from a recorded one.
+    flight goes on from a recorded one. With `view` a window shows it live, at wall-clock pace unless told otherwise.
 
     Raises:
         CosimError, MeshError, AgentError, SessionError: bad input.
@@ -99,6 +104,8 @@ def launch(
     def say(text: str) -> None:
         click.echo(text, err=as_json)
 
+    if view is not None and options.realtime is None:
+        options = replace(options, realtime=1.0)
     check_folder(options.out)
     check_options(options)
     command = None if options.connect is not None else physics_command(options.server)
@@ -110,6 +117,7 @@ def launch(
         say(note)
     with ExitStack() as stack:
         folder = stack.enter_context(new_folder(options.out, _label(options, mesh, choice)))
+        window = stack.enter_context(LiveView(view, say))
         pilot = read_pilot(choice, Terms(options.dt, options.allow_mismatch, conditions.drone))
         # On offer before the physics process starts: a second launch of the same name never starts one, which
         # might serve this session.
@@ -138,6 +146,8 @@ def launch(
             say(
                 "the physics side has no walls: contact is judged from the clearance, and nothing stops the drone"
             )
+        seen = float(conditions.drawn["field_of_view"][0])
+        window.start(rendezvous, conduit.description["mesh"], options.start_end, pilot.settings, seen)
         report = _fly_recorded(
             Flight(options, conduit, pilot, conditions, session, rendezvous, folder), after
         )

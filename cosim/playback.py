@@ -59,10 +59,9 @@ class Playback:
             DroneFigure(
                 stage,
                 track.sensors,
-                walls[id(track.scene.tube)] if id(track.scene.tube) in walls else next(iter(walls.values())),
+                walls[id(track.scene.tube)],
                 body_radius=track.body_radius,
                 colour=shade,
-                senses=True,
             )
             for track, shade in zip(tracks, own, strict=True)
         ]
@@ -95,13 +94,10 @@ class Playback:
                     else None,
                 ),
             )
-        several = len(self._tracks) > 1
-        self._say(
-            "\n".join(
-                f"{track.name}: {track.words(track.at(time))}" if several else track.words(track.at(time))
-                for track in self._tracks
-            )
-        )
+        if len(self._tracks) == 1:
+            self._say(self.leader.words(k))
+        else:
+            self._say("\n".join(track.brief(track.at(time)) for track in self._tracks))
         self.look(k)
 
     def look(self, k: int) -> None:

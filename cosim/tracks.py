@@ -68,20 +68,34 @@ class Track:
     def words(self, k: int) -> str:
         """What there is to say of record k, in two lines."""
         record = self.record(k)
-        gap = float(record["clearance"]) - self.body_radius
-        regime = Regime(int(record["regime"])).name.lower()
-        outcome = Outcome(int(record["outcome"]))
-        ended = "" if outcome is Outcome.RUNNING else f"   {outcome.name}"
-        touched = "   CONTACT" if record["contact"] else ""
         speed = float(np.linalg.norm(record["linear_velocity"]))
+        touched = "   CONTACT" if record["contact"] else ""
         return (
             f"step {k} of {self.last}   {self.scene.times[k]:.1f} s   "
-            f"{100.0 * float(record['progress']):.1f} % of {self.length:.1f} m\n"
-            f"{speed:.2f} m/s   gap {gap:.2f} m   target {_SEEN[regime]}{touched}{ended}"
+            f"{100.0 * float(record['progress']):.1f} % of {self.length:.1f} m{self._end(record)}\n"
+            f"{speed:.2f} m/s   gap {self._gap(record):.2f} m   target {self._target(record)}{touched}"
         )
 
+    def brief(self, k: int) -> str:
+        """What there is to say of record k beside others, in one line."""
+        record = self.record(k)
+        return (
+            f"{self.name}   {self.scene.times[k]:.1f} s   {100.0 * float(record['progress']):.1f} %   "
+            f"gap {self._gap(record):.2f} m{self._end(record)}"
+        )
 
-_SEEN: Final = {"visible": "in view", "memory": "remembered", "blind": "lost"}
+    def _gap(self, record: Any) -> float:
+        return float(record["clearance"]) - self.body_radius
+
+    def _target(self, record: Any) -> str:
+        return _SEEN[Regime(int(record["regime"]))]
+
+    def _end(self, record: Any) -> str:
+        outcome = Outcome(int(record["outcome"]))
+        return "" if outcome is Outcome.RUNNING else f"   {outcome.name}"
+
+
+_SEEN: Final = {Regime.VISIBLE: "in view", Regime.MEMORY: "remembered", Regime.BLIND: "lost"}
 
 
 def read_tracks(folders: Sequence[Path]) -> tuple[Track, ...]:

@@ -14,12 +14,13 @@ from typing import Any, Final
 
 import numpy as np
 import vedo
+import vtkmodules.vtkRenderingOpenGL2  # noqa: F401  without it a window has no kind
 from numpy.typing import NDArray
 from vtkmodules.vtkCommonCore import vtkLogger
 from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
 from cosim.cameras import Camera
-from cosim.errors import ViewError
+from cosim.errors import NoDisplayError, ViewError
 from cosim.film import Image
 from cosim.scene import Surface
 
@@ -63,8 +64,10 @@ class Stage:
         offscreen: draw to pictures, without a window or a display.
         title: of the window.
         sky: colours of the background, bottom and top.
+        smooth: soften edges, which takes time where no graphics card draws.
 
     Raises:
+        NoDisplayError: a window is wanted, and there is no display.
         ViewError: nothing can be drawn here; says what is missing.
     """
 
@@ -75,8 +78,10 @@ class Stage:
         offscreen: bool,
         title: str,
         sky: tuple[str, str],
+        smooth: bool,
     ) -> None:
         _prepare(offscreen)
+        vedo.settings.multi_samples = 4 if smooth else 0
         self.size = size
         self._plotter = vedo.Plotter(
             size=size, offscreen=offscreen, title=title, bg=sky[0], bg2=sky[1], interactive=False
@@ -98,9 +103,11 @@ class Stage:
         # Its winding decides what is left out, and must stay as it is.
         mesh.compute_normals(feature_angle=50, consistency=False)
         if cut:
-            ghostly = mesh.clone().backface_culling(True).alpha(ghost).lighting("default")
+            if ghost > 0.0:
+                ghostly = mesh.clone().backface_culling(True).alpha(ghost).lighting("default")
+                self._plotter.add(ghostly)
             mesh.frontface_culling(True).lighting(ambient=0.5, diffuse=0.55, specular=0.05)
-            self._plotter.add(mesh, ghostly)
+            self._plotter.add(mesh)
         else:
             self._plotter.add(mesh.alpha(ghost).lighting(ambient=0.3, diffuse=0.75, specular=0.15))
 
@@ -232,7 +239,7 @@ class Stage:
             0,
             last,
             value=0,
-            pos=[(0.28, 0.06), (0.86, 0.06)],
+            pos=[(0.32, 0.06), (0.86, 0.06)],
             show_value=False,
             c=INK,
             slider_length=0.012,
@@ -289,7 +296,6 @@ def _prepare(offscreen: bool) -> None:
     """
     vedo.settings.default_backend = "vtk"
     vedo.settings.default_font = FONT
-    vedo.settings.multi_samples = 4
     vedo.settings.enable_default_keyboard_callbacks = False
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
     if sys.platform != "linux":
@@ -300,10 +306,7 @@ def _prepare(offscreen: bool) -> None:
     if not offscreen and kind != "vtkXOpenGLRenderWindow":
         display = os.environ.get("DISPLAY")
         found = f"DISPLAY={display}, which cannot be opened" if display else "none"
-        raise ViewError(
-            f"a window: expected a display, found {found}; without one give --screenshot FILE.png or "
-            "--movie FILE.mp4"
-        )
+        raise NoDisplayError(f"a window: expected a display, found {found}")
     if kind == "vtkOSOpenGLRenderWindow" and not any(map(_loads, _OSMESA)):
         raise ViewError(
             "drawing without a display: expected EGL or OSMesa, found neither; "

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from cosim.errors import ViewError
+from cosim.errors import NoDisplayError, ViewError
 from cosim.film import INSTALL, check_outputs, write_film, write_picture
 from cosim.live import counting
 from cosim.mesh_view import MeshChoice, draw_figure, put_up_mesh
 from cosim.options import SHIPPED_MESH
-from cosim.pilots import existing_file
 from cosim.playback import Playback, View
 from cosim.tracks import Quantity, Track, read_tracks
 from meshes.tube import INDUSTRIAL
@@ -79,12 +78,16 @@ def view(options: ViewOptions) -> None:
     runs = [source for source in options.sources if source.is_dir()]
     if runs and len(runs) < len(options.sources):
         raise ViewError("expected run folders or one mesh, found both")
-    if runs:
-        if options.figure is not None:
-            raise ViewError("--figure: expected a mesh, found a run; name the mesh that it was flown in")
-        _view_runs(options, read_tracks(runs))
-    else:
-        _view_mesh(options)
+    try:
+        if runs:
+            _view_runs(options, read_tracks(runs))
+        else:
+            _view_mesh(options)
+    except NoDisplayError as error:
+        error.add_note(
+            "without a display give --screenshot FILE.png or --movie FILE.mp4, or run under xvfb-run"
+        )
+        raise
 
 
 def open_stage(
@@ -93,6 +96,7 @@ def open_stage(
     offscreen: bool,
     title: str = "cosim view",
     sky: tuple[str, str] = SKY,
+    smooth: bool = True,
 ) -> Stage:
     """An empty stage.
 
@@ -103,10 +107,12 @@ def open_stage(
         from cosim.vedo_scene import Stage
     except ImportError as error:
         raise ViewError(f"viewing needs {error.name}; {INSTALL}") from error
-    return Stage(size, offscreen=offscreen, title=title, sky=sky)
+    return Stage(size, offscreen=offscreen, title=title, sky=sky, smooth=smooth)
 
 
 def _view_runs(options: ViewOptions, tracks: tuple[Track, ...]) -> None:
+    if options.figure is not None:
+        raise ViewError("--figure: expected a mesh, found a run; name the mesh that it was flown in")
     for track in tracks:
         if track.scene.note:
             click.echo(f"{track.run.folder}: {track.scene.note}", err=True)
@@ -155,7 +161,9 @@ def _view_mesh(options: ViewOptions) -> None:
     for name, given in (("--movie", options.movie), ("--step", options.step), ("--colour", options.colour)):
         if given is not None:
             raise ViewError(f"{name}: expected a run, found a mesh, in which nothing moves")
-    path = existing_file("mesh", str(named[0]), SHIPPED_MESH, INDUSTRIAL)
+    path = INDUSTRIAL if str(named[0]) == SHIPPED_MESH and not named[0].is_file() else named[0]
+    if not path.is_file():
+        raise ViewError(f"{path}: expected a run folder or the file of a mesh, found neither")
     tube = options.mesh.read(path)
     if tube.note:
         click.echo(tube.note, err=True)

@@ -33,10 +33,10 @@ class Controls:
         """Wall-clock time and simulated time at which playing began."""
         stage.on_key(self.press)
         self._slide = stage.slider(max(playback.last, 1), self._slid)
-        self._play = stage.button(("Play ", "Pause"), (0.06, 0.06), self.toggle)
-        stage.button(("<",), (0.125, 0.06), lambda: self.step(-1))
-        stage.button((">",), (0.16, 0.06), lambda: self.step(1))
-        stage.button(("View",), (0.215, 0.06), self.change_view)
+        self._play = stage.button(("Play ", "Pause"), (0.055, 0.06), self.toggle)
+        stage.button(("<",), (0.128, 0.06), lambda: self.step(-1))
+        stage.button((">",), (0.171, 0.06), lambda: self.step(1))
+        stage.button(("View",), (0.238, 0.06), self.change_view)
         stage.text(KEYS, "bottom-left", size=0.6)
         self.go_to(begin)
 

@@ -1,0 +1,220 @@
+"""`cosim launch --view`: a live window in a process of its own, which looks on at the session and touches nothing.
+
+Poses and commands are on the wire, and shown as they are. LiDAR rays and the camera's field are computed here from
+the mesh, without the sensors' noise; target, memory and reward are the agent's alone, and left out: `cosim view`
+shows them afterwards.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Final, Self
+
+import protocol
+from agent_client.settings import Settings
+from cosim.senses import Sensors
+from cosim.watch import step_back
+from protocol.liveness import describe_exit
+
+FRAMES_PER_S: Final = 10.0
+READY: Final = b"ready\n"
+READY_S: Final = 15.0
+"""How long a flight waits for its window (s); after that it goes on without."""
+LINGER_S: Final = 2.0
+"""How long the window stays when the session has ended (s)."""
+STOP_S: Final = 2.0
+"""How long the viewer may take to end (s) before it is killed."""
+
+_VIEWER: Final = (
+    f"import sys; sys.path.append({str(Path(protocol.__file__).resolve().parents[1])!r}); "
+    "from cosim.live_view import main; sys.exit(main(sys.argv[1]))"
+)
+
+
+@dataclass(frozen=True)
+class ViewChoice:
+    """That a flight is to be seen live."""
+
+    frames: Path | None = None
+    """Folder for pictures in place of a window; for tests."""
+
+
+@dataclass(frozen=True)
+class Watched:
+    """What the viewer is told of a flight."""
+
+    rendezvous: str
+    mesh: str
+    centreline: str
+    axes: str
+    scale: float
+    start_end: str
+    sensors: Sensors
+    body_radius: float
+    """(m)"""
+    frames: str | None = None
+    """Folder for pictures, which are drawn in place of a window; for tests."""
+
+
+class LiveView:
+    """The viewer as a child of ours, in a process group of its own; whatever becomes of it, the flight goes on.
+
+    Args:
+        choice: how it is to be seen; None: not at all, and nothing is started.
+        say: tells the user; called once at most.
+    """
+
+    def __init__(self, choice: ViewChoice | None, say: Callable[[str], None]) -> None:
+        self._choice, self._say = choice, say
+        self._process: subprocess.Popen[bytes] | None = None
+        self._errors: IO[bytes] | None = None
+
+    def start(
+        self,
+        rendezvous: str,
+        described: dict[str, Any],
+        start_end: str,
+        settings: Settings,
+        field_of_view: float,
+    ) -> None:
+        """Start it, and wait for its first picture, but not for long.
+
+        Args:
+            rendezvous: of the session, which is on offer.
+            described: the tube's entry `mesh` in the manifest.
+            start_end: end of the centreline to start from.
+            settings: of the task.
+            field_of_view: the flight's condition.
+        """
+        if self._choice is None:
+            return
+        frames = self._choice.frames
+        what = Watched(
+            rendezvous=rendezvous,
+            mesh=described["path"],
+            centreline=described["centreline"],
+            axes=described["axes"],
+            scale=described["scale"],
+            start_end=start_end,
+            sensors=Sensors.of_settings(settings, field_of_view),
+            body_radius=settings.drone.body_radius,
+            frames=None if frames is None else str(frames.resolve()),
+        )
+        command = [sys.executable, "-P", "-c", _VIEWER, json.dumps(asdict(what))]
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  closed by __exit__
+        self._launch(command)
+
+    def _launch(self, command: list[str]) -> None:
+        assert self._errors is not None
+        try:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                start_new_session=True,
+            )
+        except OSError as error:
+            self._say(f"live view: cannot be started: {error.strerror}; the flight goes on without it")
+            return
+        assert self._process.stdout is not None
+        if not select.select([self._process.stdout], [], [], READY_S)[0]:
+            self._say(
+                f"live view: no picture within {READY_S:g} s; the flight goes on, and it may come later"
+            )
+        elif os.read(self._process.stdout.fileno(), len(READY)) != READY:
+            self._give_up("the flight goes on without it")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._process is not None:
+            if error is None:
+                with suppress(subprocess.TimeoutExpired):  # it lingers, and leaves by itself
+                    self._process.wait(LINGER_S + STOP_S)
+            if self._process.poll() is None:
+                self._process.terminate()
+                with suppress(subprocess.TimeoutExpired):
+                    self._process.wait(STOP_S)
+            self._process.kill()
+            if self._process.wait() > 0 or (error is None and self._process.returncode < 0):
+                self._give_up("the flight went on without it")
+        if self._errors is not None:
+            self._errors.close()
+
+    def _give_up(self, then: str) -> None:
+        """Say why there is no view any more, once."""
+        process, errors = self._process, self._errors
+        assert process is not None
+        assert errors is not None
+        self._process = None
+        try:
+            code = process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            code = process.wait()
+        errors.seek(0)
+        words = errors.read().decode(errors="replace").strip().splitlines()
+        why = words[-1] if words else describe_exit(code)
+        self._say(f"live view: {why}; {then}")
+
+
+def main(told: str) -> int:
+    """The viewer's process; returns its exit status."""
+    step_back()
+    # One thread draws: where there is no graphics card, others would take the cores of the session.
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+    # Here, after the step back: they take a second of a core.
+    from cosim.errors import CosimError
+    from cosim.live_scene import LiveScene
+    from meshes.errors import MeshError
+    from protocol.errors import ProtocolError
+    from protocol.observer import Observer
+
+    found = json.loads(told)
+    what = Watched(**found | {"sensors": Sensors(**found["sensors"])})
+    try:
+        with Observer.attach(what.rendezvous) as observer:
+            scene = LiveScene(what)
+            try:
+                scene.draw(observer)
+                with suppress(BrokenPipeError):  # the launcher does not wait any more
+                    os.write(1, READY)
+                _look_on(scene, observer)
+            finally:
+                scene.close()
+    except (CosimError, MeshError, ProtocolError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
+def _look_on(scene: Any, observer: Any) -> None:
+    """Until the session ends or the window is closed."""
+    due = time.monotonic()
+    while scene.open:
+        now = time.monotonic()
+        if now >= due:
+            ended = observer.status().ended
+            scene.draw(observer)
+            if ended:
+                break
+            due = max(due + 1.0 / FRAMES_PER_S, time.monotonic())
+        scene.wait(due)
+    else:
+        return
+    scene.linger(LINGER_S)
