@@ -20,11 +20,11 @@ function evaluationOf(evaluation, runs, onFocus) {
       ...flown.map((row) => evaluationRow(row, row.policy, "")),
     ];
   });
-  const head = ["pilot", "success", "", "exit", "collision", "time-out", "Q", "steps", "length"];
+  const head = ["pilot", ">success", "", ">exit", ">collision", ">time-out", ">Q", ">steps", ">length"];
   return [
     make("h1", {}, "Evaluation"),
     ...evaluation.heading.map((line) => make("p", { class: "lead small" }, line)),
-    table(head, rows, 3),
+    table(head, rows),
     make(
       "details",
       { class: "legend-text" },
@@ -111,7 +111,7 @@ function failuresOf(evaluation, runs, onFocus) {
       { class: "small" },
       `A failure is flown again by its command, ${repeats}; give its run folder to this report as well to see its replay here.`,
     ),
-    table(["pilot", "level", "seed", "outcome", "steps", "progress", "smallest gap", "replay"], body, 99),
+    table(["pilot", ">level", ">seed", "outcome", ">steps", ">progress", ">smallest gap", "replay"], body),
     ...(more ? [more] : []),
   ];
 }

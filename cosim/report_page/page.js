@@ -231,7 +231,7 @@ class Report {
     this.choose(run, same ? this.visible : new Set(this.runs.filter((other) => other.tube === run.tube)));
     this.player.seek(time);
     this.view?.setCamera(this.view.cameraMode);
-    byId("replay").scrollIntoView({ block: "start", behavior: "smooth" });
+    byId("view").scrollIntoView({ block: "start" });
   }
 
   show(run, shown) {

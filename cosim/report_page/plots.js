@@ -88,7 +88,7 @@ class Chart {
 
   draw() {
     const { definition, plots } = this,
-      width = this.svg.clientWidth || 300;
+      { width } = this;
     this.svg.setAttribute("viewBox", `0 0 ${width} ${HEIGHT}`);
     const [left, right] = [MARGIN.left, width - MARGIN.right],
       [x0, x1] = plots.range;
@@ -241,7 +241,8 @@ class Plots {
     this.time = 0;
     this.charts = CHARTS.map((definition) => new Chart(definition, this));
     root.append(...this.charts.map((chart) => chart.root));
-    new ResizeObserver(() => this.draw()).observe(root);
+    this.measure();
+    new ResizeObserver(() => this.measure() && this.draw()).observe(root);
   }
 
   abscissa(run) {
@@ -274,6 +275,14 @@ class Plots {
     this.focus = focus;
     this.runs = this.all.filter((run) => visible.has(run));
     this.draw();
+  }
+
+  /** Take the charts' widths, all before anything is drawn; returns whether they changed. */
+  measure() {
+    const widths = this.charts.map((chart) => chart.svg.clientWidth || 300);
+    const changed = this.charts.some((chart, i) => chart.width !== widths[i]);
+    this.charts.forEach((chart, i) => (chart.width = widths[i]));
+    return changed;
   }
 
   draw() {

@@ -80,7 +80,7 @@ function thinnedNotes(data) {
 
 /** The table of several runs, which is the legend as well: a tick shows a run, its name brings it into focus. */
 function runsTable(runs, onFocus, onVisible) {
-  const head = ["", "run", "pilot", "tube", "outcome", "steps", "progress", "Q", "smallest gap", "contact"];
+  const head = ["", "run", "pilot", "tube", "outcome", ">steps", ">progress", ">Q", ">smallest gap", ">contact"];
   const rows = runs.map((run) => {
     const tick = make("input", {
       type: "checkbox",
@@ -113,12 +113,14 @@ function runsTable(runs, onFocus, onVisible) {
       ),
     );
   });
-  return table(head, rows, 5);
+  return table(head, rows);
 }
 
-/** A table whose columns from `numbers` on are right-aligned; it scrolls by itself where it is too wide. */
-function table(head, rows, numbers) {
-  const cells = head.map((text, i) => make("th", { scope: "col", class: i >= numbers ? "number" : null }, text));
+/** A table, which scrolls by itself where it is too wide; columns whose head begins with ">" are right-aligned. */
+function table(head, rows) {
+  const cells = head.map((text) =>
+    make("th", { scope: "col", class: text.startsWith(">") ? "number" : null }, text.replace(">", "")),
+  );
   return make(
     "div",
     { class: "scroll", tabindex: "0" },
@@ -193,9 +195,8 @@ function phasesOf(run) {
   );
   return [
     table(
-      ["", "share", "distribution (logarithmic; marked: median, 99th percentile)", "p50", "p99", "longest"],
+      ["", "share", "distribution (logarithmic; marked: median, 99th percentile)", ">p50", ">p99", ">longest"],
       [...body, foot],
-      3,
     ),
   ];
 }

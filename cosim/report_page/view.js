@@ -256,7 +256,8 @@ class View {
 
   resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
-    if (!width || !height) return;
+    if (!width || !height || (width === this.width && height === this.height)) return;
+    [this.width, this.height] = [width, height];
     this._size(this.ratio);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
@@ -264,9 +265,8 @@ class View {
   }
 
   _size(ratio) {
-    const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
     this.renderer.setPixelRatio(ratio);
-    this.renderer.setSize(width, height, false);
+    this.renderer.setSize(this.width, this.height, false);
   }
 
   /** Draw with the next frame. Without a GPU edges are smoothed only once nothing has moved for a while. */
