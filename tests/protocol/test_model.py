@@ -22,38 +22,33 @@ DEADLINE_S = 240.0
 
 VIOLATION = r"assertion violated \(0\|\|\(what!=\d+\)\)"
 FAULTS = {
-    "BEGIN_LAST": (
-        "OBSERVED",
-        r"assertion violated \(\(begin!=end_\)\|\|",
-    ),  # a torn message taken for a whole one
-    "DOORBELL_FIRST": ("OBSERVED", VIOLATION),  # one correct side sees a violation by the other
-    "NO_LAST_LOOK": ("OBSERVED", r"assertion violated .*\.bell[!=]=number\)"),  # a reply lost with its writer
-    "NO_LIVENESS": ("EVERY_REQUEST", "invalid end state"),  # nobody moves any more
-    "NO_LOCK": ("TAKEOVER", r"assertion violated +!\(pose\[mine\]\.magic\)"),  # two that serve one session
+    # a torn message taken for a whole one
+    "BEGIN_LAST": ("OBSERVED", r"assertion violated \(\(begin!=end_\)\|\|"),
+    # one correct side sees a violation by the other
+    "DOORBELL_FIRST": ("OBSERVED", VIOLATION),
+    # a reply lost with its writer
+    "NO_LAST_LOOK": ("OBSERVED", r"assertion violated .*\.bell[!=]=number\)"),
+    # nobody moves any more
+    "NO_LIVENESS": ("EVERY_REQUEST", "invalid end state"),
+    # two that serve one session
+    "NO_LOCK": ("TAKEOVER", r"assertion violated +!\(pose\[mine\]\.magic\)"),
     "SERVED_TWICE": ("TAKEOVER", VIOLATION),
-    "COMMAND_REMOVED_FIRST": (
-        "RESTART",
-        r"assertion violated \(pose_name==15\)",
-    ),  # a stale .pose stands alone
-    "MAGIC_FIRST": (
-        "RESTART",
-        r"assertion violated \(cmd\[at\]\.session==at\)",
-    ),  # a header that is not whole
-    "NO_NAME_CHECK": (
-        "RESTART",
-        r"assertion violated \(pose\[me\]\.session==me\)",
-    ),  # one's .cmd, another's .pose
-    "NO_REMOVAL": ("RESTART", r"assertion violated .*killed_last\[pose_name\]"),  # segments outlive everybody
-    "NO_SECOND_LOOK": (
-        "RESTART",
-        r"assertion violated \(pose_name==15\)",
-    ),  # two agents believe to have the name
-    "REMOVED_UNLOCKED": (
-        "RESTART",
-        r"assertion violated .*(\.lock!=|_name==15\))",
-    ),  # a newer session's name goes
-    "UNLINK_BLIND": ("RESTART", r"assertion violated .*(\.lock!=|_name==15\))"),  # the same
-    "NO_STEP_CHECK": ("ROGUE", r"assertion violated \(\(lie==0\)\|\|"),  # a lie is answered
+    # a stale .pose stands alone
+    "COMMAND_REMOVED_FIRST": ("RESTART", r"assertion violated \(pose_name==15\)"),
+    # a header that is not whole
+    "MAGIC_FIRST": ("RESTART", r"assertion violated \(cmd\[at\]\.session==at\)"),
+    # one's .cmd, another's .pose
+    "NO_NAME_CHECK": ("RESTART", r"assertion violated \(pose\[me\]\.session==me\)"),
+    # segments outlive everybody
+    "NO_REMOVAL": ("RESTART", r"assertion violated .*killed_last\[pose_name\]"),
+    # two agents believe to have the name
+    "NO_SECOND_LOOK": ("RESTART", r"assertion violated \(pose_name==15\)"),
+    # a newer session's name goes
+    "REMOVED_UNLOCKED": ("RESTART", r"assertion violated .*(\.lock!=|_name==15\))"),
+    # a newer session's name goes, too
+    "UNLINK_BLIND": ("RESTART", r"assertion violated .*(\.lock!=|_name==15\))"),
+    # a lie is answered
+    "NO_STEP_CHECK": ("ROGUE", r"assertion violated \(\(lie==0\)\|\|"),
 }
 """Each fault that may be seeded, the configuration that finds it, and what spin says then."""
 
