@@ -77,9 +77,8 @@ def _agent_killed(rig: Rig) -> str:
 )
 def _agent_killed_at_work(rig: Rig) -> str:
     with at_work(rig) as s:
-        demand(s.agent.get("doorbell") < s.agent.number, "the engine", "at work", "done")
         s.stand_in.kill()
-        until = time.monotonic() + rig.timeout
+        until = s.go_on() + rig.timeout
         while s.agent.get("doorbell") < s.agent.number and segments_left(s.agent.rendezvous):
             demand(time.monotonic() < until, "the engine", f"done within {rig.timeout:g} s", "still at work")
             time.sleep(0.001)

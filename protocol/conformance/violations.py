@@ -175,7 +175,6 @@ def _early_doorbell(rig: Rig) -> None:
 def _early_at_work(rig: Rig) -> None:
     for word in ("begin", "doorbell"):
         with at_work(rig) as s:
-            demand(s.agent.get("doorbell") < s.agent.number, "the engine", "at work", "done")
             s.agent.put(**{word: s.agent.number + 1})
             _ends(s, f"an early {word} at work")
 
