@@ -48,10 +48,7 @@ def _in_every_state(rig: Rig, fault: Callable[[RawPhysics], None], what: str) ->
     for state, op in entered(rig).items():
         with asked(rig, op) as (physics, _):
             fault(physics)
-            # Whoever is on its way out, with nothing left to do, may have succeeded all the same.
-            took[state] = ends(
-                physics, time.monotonic(), f"{what} in {state.name}", failed=op is not Op.GOODBYE
-            )
+            took[state] = ends(physics, time.monotonic(), f"{what} in {state.name}")
     with asked(rig, Op.STEP) as (physics, request):
         physics.answer(request)
         fault(physics)
@@ -85,7 +82,7 @@ def _kill_unreaped(physics: RawPhysics) -> None:
     covers=_covers(Event.LOSS)[1:],
 )
 def _physics_killed(rig: Rig) -> str:
-    """Each state is a session of its own; the exit status is not 0."""
+    """Each state is a session of its own; the exit status is not 0, but for a goodbye that finds nobody."""
     return _in_every_state(rig, _kill, "the death of the physics side")
 
 
@@ -102,7 +99,7 @@ def _physics_zombie(rig: Rig) -> str:
     "physics-pid-reused", ROBUSTNESS, "10", "a process of the physics side's pid but another start is not it"
 )
 def _physics_pid_reused(rig: Rig) -> None:
-    """The header names a living process with an earlier start."""
+    """The header names a living process with an earlier start; the agent sees it while it waits for a reply."""
     with meeting(rig) as physics:
         physics.begin_header()
         assert physics.stand_in is not None

@@ -15,7 +15,7 @@ from protocol.conformance.raw_physics import RawPhysics, Request
 from protocol.conformance.rig import LEAVING_S, Rig, await_end, segments_left
 from protocol.conformance.rule import Failure, Skip, demand
 from protocol.conformance.scenes import ALLOWANCE_S, NOTICE_S, UNDER_WAY
-from protocol.layout import Farewell, Op
+from protocol.layout import COMMAND, Farewell, Op, read_i64
 from protocol.states import State
 
 BOUND_S: Final = NOTICE_S + ALLOWANCE_S
@@ -48,14 +48,13 @@ def has_left(physics: RawPhysics) -> bool:
     return physics.farewell()[0] != 0 or physics.process.watch() is not None
 
 
-def ends(physics: RawPhysics, since: float, what: str, *, failed: bool = True) -> float:
+def ends(physics: RawPhysics, since: float, what: str) -> float:
     """Demand that the agent ends the session in time and leaves nothing; return how long it took to leave (s).
 
     Args:
         physics: the session.
         since: when it could notice first (monotonic).
         what: what happened, for messages.
-        failed: whether its exit status must be another than 0.
     """
     stood = bool(
         segments_left(physics.rendezvous)
@@ -67,11 +66,11 @@ def ends(physics: RawPhysics, since: float, what: str, *, failed: bool = True) -
             )
         time.sleep(POLL_S)
     took = time.monotonic() - since
-    _leaves_nothing(physics, what, failed)
+    _leaves_nothing(physics, what)
     return took
 
 
-def turns_down(physics: RawPhysics, what: str, kind: Farewell, *, last: int, failed: bool = True) -> str:
+def turns_down(physics: RawPhysics, what: str, kind: Farewell, *, last: int) -> str:
     """Demand that the agent ends the session with a farewell of one kind, and return its text.
 
     Args:
@@ -79,7 +78,6 @@ def turns_down(physics: RawPhysics, what: str, kind: Farewell, *, last: int, fai
         what: what was wrong, for messages.
         kind: the farewell that it calls for.
         last: number of the last request that the agent could make before it saw that.
-        failed: whether its exit status must be another than 0.
     """
     until = time.monotonic() + LEAVING_S
     while not has_left(physics):
@@ -91,15 +89,17 @@ def turns_down(physics: RawPhysics, what: str, kind: Farewell, *, last: int, fai
         )
         demand(time.monotonic() < until, f"the agent after {what}", "to end the session", "it has not")
         time.sleep(POLL_S)
-    _leaves_nothing(physics, what, failed)
+    _leaves_nothing(physics, what)
     found, text = physics.farewell()
     right = found == kind and bool(text)
     demand(right, f"farewell after {what}", f"kind {kind.value} with a text", f"kind {found}, {text!r}")
     return text
 
 
-def _leaves_nothing(physics: RawPhysics, what: str, failed: bool) -> None:
+def _leaves_nothing(physics: RawPhysics, what: str) -> None:
+    """Demand that the agent ends, with nothing left; who had come to its goodbye may have succeeded all the same."""
     code = await_end(physics.process, f"after {what}")
     left = segments_left(physics.rendezvous)
     demand(not left, f"segments after {what}", "both removed by the agent", left)
-    demand(code != 0 or not failed, f"exit status after {what}", "another than 0", code)
+    said_goodbye = physics.rung() > 0 and read_i64(physics.command, COMMAND["op"]) == Op.GOODBYE
+    demand(code != 0 or said_goodbye, f"exit status after {what}", "another than 0", code)

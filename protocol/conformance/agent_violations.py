@@ -138,14 +138,7 @@ def _answers_wrongly(rig: Rig, op: Op, what: str, wrong: Callable[[RawPhysics, R
         words = wrong(physics, request)
         physics.reply(request.rung, words)
         physics.steps = steps
-        # Who has said goodbye has nothing left to fail at.
-        turns_down(
-            physics,
-            f"{what} to a {op.name}",
-            Farewell.VIOLATION,
-            last=request.rung,
-            failed=op is not Op.GOODBYE,
-        )
+        turns_down(physics, f"{what} to a {op.name}", Farewell.VIOLATION, last=request.rung)
 
 
 def _to_every_request(rig: Rig, what: str, wrong: Callable[[RawPhysics, Request], Wrong]) -> str:
