@@ -4,6 +4,7 @@ const UP = new THREE.Vector3(0, 0, 1);
 const LAYERS = { path: "path", axis: "centreline", rays: "LiDAR", cone: "camera", target: "target" };
 const FOLLOW_DISTANCE = 5; // over R
 const REST = 350; // ms
+const HAZE = 0.35; // an R of distance, on board
 const FILLED = 0.84; // of the view, by the tube
 /** Whether a GPU draws; else the processor does, and smooth edges would cost most of its time. */
 function drawnByGpu() {
@@ -108,7 +109,7 @@ class View {
 
   /** Take colours from the style sheet, at the start and when the colour scheme changes. */
   paint(pathColours) {
-    this.tubes.forEach((tube) => tube.paint(this.cameraMode === "aboard" ? 0.12 / this.radius : 0));
+    this.tubes.forEach((tube) => tube.paint(this.cameraMode === "aboard" ? HAZE / this.radius : 0));
     for (const axis of this.axes) axis.material.color.set(cssColour("--axis"));
     this.senses.paint();
     for (const view of this.runs) {
@@ -170,7 +171,7 @@ class View {
     }
     camera.updateProjectionMatrix();
     this.setTube(this.tubeMode);
-    this.tubes.forEach((tube) => tube.paint(mode === "aboard" ? 0.12 / this.radius : 0));
+    this.tubes.forEach((tube) => tube.paint(mode === "aboard" ? HAZE / this.radius : 0));
     this.place(this.time);
     if (this.controls.enabled) this.controls.update();
   }
