@@ -128,7 +128,6 @@ def launch(
         if command is None:
             say(f"waiting for a physics peer at {rendezvous} (at most {options.attach_timeout:g} s)")
         else:
-            say(f"session: {rendezvous} (cosim watch shows its live state)")
             process = stack.enter_context(PhysicsProcess(command, rendezvous, folder))
         if mesh is None:
             conduit = generate_conduit(options, recipe, folder)
@@ -140,6 +139,8 @@ def launch(
         session = stack.enter_context(
             attached_session(offer, process=process, attach_timeout=options.attach_timeout)
         )
+        if process is not None:
+            say(f"session: {rendezvous} (cosim watch shows its live state)")
         plant = session.description
         say(f"physics: {plant.name} {plant.version}, engine {plant.engine}")
         if not plant.walls:
