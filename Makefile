@@ -10,7 +10,7 @@ launch: $(VENV)/.fly
 	$(BIN)/cosim launch
 
 test: $(VENV)/.all check
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 check: $(VENV)/.all
 	$(BIN)/ruff check .
@@ -45,6 +45,6 @@ $(VENV)/.fly: pyproject.toml constraints.txt | $(BIN)/python
 	@touch $@
 
 $(VENV)/.all: pyproject.toml constraints.txt | $(BIN)/python
-	@echo "installing everything with the extras train, view, export and dev into $(VENV)"
-	$(PIP) --editable '.[train,view,export,dev]'
+	@echo "installing everything with the extras train, view, export, bench and dev into $(VENV)"
+	$(PIP) --editable '.[train,view,export,bench,dev]'
 	@touch $@ $(VENV)/.fly
