@@ -35,8 +35,12 @@ class ConformanceOptions:
     junit: Path | None
 
 
-def conformance(options: ConformanceOptions, *, as_json: bool, as_list: bool) -> bool:
+def conformance(
+    options: ConformanceOptions, *, as_json: bool, as_list: bool, failed_only: bool = False
+) -> bool:
     """Run the rules and print the report, or list them; returns whether every required one holds.
+
+    With `failed_only` the text leaves out the rules that passed.
 
     Raises:
         click.UsageError: neither or both sides were named, or a level or rule is unknown.
@@ -59,9 +63,8 @@ def conformance(options: ConformanceOptions, *, as_json: bool, as_list: bool) ->
         click.echo(json.dumps(json_report(results, side, command, options.transport)))
     else:
         version = f"{VERSION_MAJOR}.{VERSION_MINOR}"
-        click.echo(
-            text_report(results, f"{side} {command!r} over {options.transport}, protocol {version}", _paint)
-        )
+        heading = f"{side} {command!r} over {options.transport}, protocol {version}"
+        click.echo(text_report(results, heading, _paint, failed_only=failed_only))
     return conforms(results)
 
 
@@ -82,8 +85,21 @@ def _check_command(side: str, command: str) -> None:
     except ValueError as error:
         raise PeerCommandError(f"--{side}: expected a command, found {command!r} ({error})") from error
     if not words or shutil.which(words[0]) is None:
-        found = repr(words[0]) if words else "an empty string"
-        raise PeerCommandError(f"--{side}: expected a program that can be run, found {found}, which cannot")
+        found = _why_not(words[0]) if words else "an empty string"
+        raise PeerCommandError(f"--{side}: expected a program that can be run, found {found}")
+
+
+def _why_not(program: str) -> str:
+    """Say why a program cannot be run, and where it was looked for."""
+    path, where = Path(program), "" if Path(program).is_absolute() else f" in {Path.cwd()}"
+    if "/" not in program:
+        hint = f"; ./{program} is the one in {Path.cwd()}" if path.is_file() else ""
+        return f"no program {program!r} on PATH{hint}"
+    if path.is_dir():
+        return f"{program!r}{where}, a folder"
+    if path.exists():
+        return f"{program!r}{where}, which is not executable: chmod +x {shlex.quote(program)}"
+    return f"no such file: {program!r}{where}"
 
 
 def _rules(side: str, options: ConformanceOptions) -> list[Rule]:

@@ -20,6 +20,8 @@ Paint = Callable[[str, Outcome], str]
 
 _NOT_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """Characters that no XML may hold, though a peer may print them."""
+_CHANGING: Final = re.compile(r"conformance-\d+-[0-9a-f]+|\d+")
+"""What differs between two runs that end alike: rendezvous, process ids, times."""
 
 
 def plain(text: str, outcome: Outcome) -> str:
@@ -27,23 +29,29 @@ def plain(text: str, outcome: Outcome) -> str:
     return text
 
 
-def text_report(results: Sequence[Result], heading: str, paint: Paint = plain) -> str:
+def text_report(
+    results: Sequence[Result], heading: str, paint: Paint = plain, *, failed_only: bool = False
+) -> str:
     """Write one line a rule under its level, with what was found below it, and the sum in the last line.
+
+    What a peer printed more than once, but for numbers in it, is shown where it first was.
 
     Args:
         results: in the order of levels.
         heading: the first line: what was judged.
         paint: colours the word of an outcome.
+        failed_only: leave out the rules that passed.
     """
-    lines, said = [heading], ""
+    lines, said, printed = [heading], "", dict[str, str]()
     for level in Level:
         of_level = [result for result in results if result.rule.level is level]
-        if not of_level:
+        shown = [r for r in of_level if not failed_only or r.outcome is not Outcome.PASSED]
+        if not shown:
             continue
         lines += ["", f"{level.value}: {_sum(of_level)}"]
-        for result in of_level:
+        for result in shown:
             lines.append(_line(result, paint))
-            remark = _remark(result)
+            remark = _remark(result, printed)
             lines += [
                 f"{_INDENT}{line}"
                 for line in (["as above"] if remark and remark == said else remark.splitlines())
@@ -66,11 +74,15 @@ def _line(result: Result, paint: Paint) -> str:
     return f"  {word}  {section:<7}  {rule.name}: {rule.title}{optional}"
 
 
-def _remark(result: Result) -> str:
-    if result.outcome is not Outcome.FAILED:
+def _remark(result: Result, printed: dict[str, str]) -> str:
+    """What was found; `printed` maps last words, their numbers aside, to the rule under which they are shown."""
+    if result.outcome is not Outcome.FAILED or not result.last_words.strip():
         return result.details
+    first = printed.setdefault(_CHANGING.sub("#", result.last_words), result.rule.name)
+    if first != result.rule.name:
+        return f"{result.details}\nthe peer printed the same as under {first}"
     words = "".join(f"\n| {line}" for line in result.last_words.splitlines())
-    return result.details + (f"\nthe peer printed:{words}" if words else "")
+    return f"{result.details}\nthe peer printed:{words}"
 
 
 def _sum(results: Sequence[Result]) -> str:

@@ -52,7 +52,9 @@ def test_a_broken_server_gives_status_1_and_names_the_rule(tmp_path: Path) -> No
     [
         ((), "--server COMMAND"),
         (("--server", "a", "--agent", "b"), "--server COMMAND"),
-        (("--server", "no-such-program"), "no-such-program"),
+        (("--server", "no-such-program"), "'no-such-program' on PATH"),
+        (("--server", "./no-such-program"), f"no such file: './no-such-program' in {Path.cwd()}"),
+        (("--server", __file__), "not executable"),
         (("--server", ""), "an empty string"),
         (("--server", "true", "--level", "core,speed"), "speed"),
         (("--server", "true", "--rule", "no-such-rule"), "no-such-rule"),

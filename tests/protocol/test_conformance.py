@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -209,6 +210,7 @@ RULES = (
     Rule("third-rule", Level.LANES, "6", "the third thing holds", _nothing),
     Rule("fourth-rule", Level.PERFORMANCE, "10", "how fast it is", _nothing, required=False),
 )
+ROBUST = Rule("fifth-rule", Level.ROBUSTNESS, "10", "a fault is noticed", _nothing)
 RESULTS = (
     Result(RULES[0], Outcome.PASSED, "", "", 0.25),
     Result(RULES[1], Outcome.FAILED, "height: expected 1, found 2 < 3", "oh\x00 dear", 0.5),
@@ -239,6 +241,40 @@ def test_the_text_has_one_line_a_rule_under_its_level() -> None:
         "",
         "does not conform: 1 passed, 2 failed, 1 skipped",
     ]
+
+
+def test_the_text_may_leave_out_what_passed() -> None:
+    """Failures, skips and the sums stay; a level of which every rule passed is left out."""
+    lines = text_report(
+        (*RESULTS, replace(RESULTS[0], rule=ROBUST)), "server 'x'", failed_only=True
+    ).splitlines()
+    assert not [line for line in lines if line.startswith("  passed") or line.startswith("robustness")]
+    assert [line.split()[0] for line in lines if line.startswith("  ") and "-rule:" in line] == [
+        *("failed", "skipped", "failed")
+    ]
+    assert lines[2] == "core: 1 passed, 1 failed"
+    assert lines[-1] == "does not conform: 2 passed, 2 failed, 1 skipped"
+
+
+def test_the_text_shows_the_same_last_words_once() -> None:
+    """Process ids and rendezvous aside; others are shown in full."""
+    words = "lost agent (pid {}) at shm:conformance-{}-{}"
+    results = [
+        Result(rule, Outcome.FAILED, f"found {number}", last_words, 0.1)
+        for number, (rule, last_words) in enumerate(
+            zip(
+                (*RULES[:3], ROBUST),
+                (words.format(1, 2, "0a"), words.format(3, 4, "ff1"), "no engine", words.format(5, 6, "b")),
+                strict=True,
+            )
+        )
+    ]
+    lines = [line.strip() for line in text_report(results, "server 'x'").splitlines()]
+    assert [line for line in lines if line.startswith("|")] == [
+        "| " + words.format(1, 2, "0a"),
+        "| no engine",
+    ]
+    assert lines.count("the peer printed the same as under first-rule") == 2
 
 
 def test_a_rule_that_is_not_required_does_not_decide() -> None:
