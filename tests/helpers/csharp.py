@@ -8,14 +8,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import kit
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from protocol import bindings
 from protocol.agent import AgentSession, SessionSettings
-from protocol.conformance.rule import Level, Outcome
-from protocol.conformance.run import run_suite, select
+from protocol.conformance.rule import Level
+from protocol.conformance.run import select
 from protocol.plant import CommandBatch, ResetBatch
 from protocol.toy import DEFAULTS, SPEED_MAX
 
@@ -70,11 +71,9 @@ def open_session(rendezvous: str, lanes: int = 1) -> AgentSession:
     return AgentSession.open(rendezvous, settings, attach_timeout=PATIENCE_S)
 
 
-def failures(program: Path, transport: str, *levels: Level) -> list[str]:
-    """Run the rules of some levels; what failed, with the server's last words."""
-    rules = select("server", levels)
-    results = run_suite(rules, f"{MONO} {program}", transport)
-    return [f"{r.rule.name}: {r.details} {r.last_words}" for r in results if r.outcome is Outcome.FAILED]
+def run_rules(program: Path, transport: str, *levels: Level) -> tuple[list[str], dict[str, str]]:
+    """Run the rules of some levels, as `kit.run` does."""
+    return kit.run(f"{MONO} {program}", transport, select("server", levels))
 
 
 def unit(rng: np.random.Generator, rows: int, words: int) -> Floats:

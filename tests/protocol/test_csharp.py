@@ -7,6 +7,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import kit
 import numpy as np
 import pytest
 from csharp import (
@@ -14,13 +15,14 @@ from csharp import (
     INNER_STEPS,
     MONO,
     PATIENCE_S,
+    SOURCES,
     Serve,
     build,
-    failures,
     needs_mono,
     open_session,
     random_commands,
     random_resets,
+    run_rules,
     serving,
 )
 from flights import run_cosim
@@ -74,8 +76,10 @@ def test_the_server_repeats_the_toy_bit_for_bit(serve: Serve, server: Path, rend
 
 @pytest.mark.parametrize("transport", ["shm", "file"])
 def test_the_server_passes_the_suite(server: Path, transport: str) -> None:
-    """Every rule that is not about speed holds, over both transports."""
-    assert failures(server, transport, Level.CORE, Level.ROBUSTNESS, Level.LANES) == []
+    """Every rule that is not about speed holds, but for those that need walls or gusts; its page says how many."""
+    found = run_rules(server, transport, Level.CORE, Level.ROBUSTNESS, Level.LANES)
+    assert found == ([], kit.SKIPPED)
+    assert kit.count_in_words() in " ".join((SOURCES / "README.md").read_text().split())
 
 
 def test_a_signal_ends_the_server_with_a_farewell(
