@@ -70,9 +70,10 @@ def watch(as_json: bool, **options: Any) -> None:
     help="To start or to answer.",
 )
 @option("--junit", type=click.Path(path_type=Path), metavar="FILE", help="Write JUnit XML as well.")
+@option("--failed", "failed_only", is_flag=True, help="Leave out of the text the rules that passed.")
 @option("--list", "as_list", is_flag=True, help="Name the rules and run none.")
 @json_option
-def conformance(as_list: bool, as_json: bool, **options: Any) -> None:
+def conformance(as_list: bool, as_json: bool, failed_only: bool, **options: Any) -> None:
     """Prove any program against the rules of the protocol, which protocol/README.md specifies.
 
     Exit status 0 if every required rule holds, else 1. A rule is skipped where the program says that it cannot do
@@ -87,7 +88,7 @@ def conformance(as_list: bool, as_json: bool, **options: Any) -> None:
     from cosim.conformance import ConformanceOptions
     from cosim.conformance import conformance as run
 
-    if not run(ConformanceOptions(**options), as_json=as_json, as_list=as_list):
+    if not run(ConformanceOptions(**options), as_json=as_json, as_list=as_list, failed_only=failed_only):
         sys.exit(EXIT_FAILED_CHECK)
 
 
