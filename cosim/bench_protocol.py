@@ -1,4 +1,4 @@
-"""`cosim bench --protocol`: round trips against the field, the machine's floor, idle cost, many lanes, in one run.
+"""`cosim bench --protocol`: round trips against the field, the machine's floor, idle cost, lanes, observers, bars.
 
 Every figure is the median of interleaved repeats. What cannot be measured here (a library, a compiler or a core that
 is missing) is named with the reason and what to install.
@@ -26,14 +26,15 @@ from cosim import native, rivals
 from cosim import round_trip as trips
 from cosim.errors import CosimError
 from cosim.idle import idle_percent
+from cosim.observer_cost import measure_observer
+from cosim.protocol_bars import EXCHANGES, ONE_CORE, WAYS, judge
 from cosim.protocol_table import protocol_table
+from cosim.requirements import install_command
 from cosim.round_trip import Quantiles, Samples, Way
 from protocol.errors import ProtocolError
 
 LANES: Final = (1, 4, 16, 64, 256)
-EXCHANGES: Final = ("stdlib", "compiled")
 BASE: Final = "udp"
-ONE_CORE: Final = "_one_core"
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Effort:
 
 
 MEASUREMENT: Final = Effort(20_000, 1.0, 5, 2.0)
-LOOK: Final = Effort(1_000, 0.2, 1, 0.3)
+LOOK: Final = Effort(500, 0.1, 3, 0.3)
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ def bench_protocol(*, as_json: bool, quick: bool, png: Path | None, only: Sequen
         as_json: one JSON object on stdout and nothing else.
         quick: a look, not a measurement.
         png: where to draw the histogram of all round trips, or None.
-        only: names of ways, where not all are wanted; neither lanes nor idle cost are measured then.
+        only: names of ways, where not all are wanted; neither lanes nor idle cost nor observers are measured then.
 
     Raises:
         CosimError: a name in `only` is unknown, or the histogram cannot be drawn.
@@ -110,8 +111,16 @@ def measure_protocol(
         idle_percent: physics, agent: of a core, while each waits for the other
         lanes: for stdlib and compiled a row for each number: lanes, step_us, transport_us (without the engine's
             own time), transport_us_per_lane, steps_per_second_per_lane, transport_over_one_lane
+        observer: by the observer's rate, what `measure_observer` returns
+        bars: the project's own bars on what was measured, rows of name, found, bar, reached
         skipped: why a way or a part could not be measured, and what to do
+
+    Raises:
+        CosimError: a name in `only` is unknown.
     """
+    unknown = [name for name in only if name not in WAYS]
+    if unknown:
+        raise CosimError(f"--only: expected some of {', '.join(WAYS)}, found {unknown[0]!r}")
     skipped: dict[str, str] = {}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cosim-bench-")))
@@ -129,6 +138,13 @@ def measure_protocol(
             figures["idle_percent"] = idle_percent(effort.idle_s, skipped)
             say("lanes ...")
             figures["lanes"] = _lanes(effort, skipped)
+            say("observers ...")
+            exchange = "stdlib" if "session_compiled" in skipped else "compiled"
+            figures["observer"] = measure_observer(effort.samples, effort.repeats, effort.seconds, exchange)
+        figures["bars"] = [
+            {"name": bar.name, "found": bar.found, "bar": bar.bar, "reached": bar.reached}
+            for bar in judge(figures)
+        ]
         figures["skipped"] = skipped
     return figures, {name: np.concatenate(rows) for name, rows in samples.items()}
 
@@ -148,7 +164,6 @@ def _entries(folder: Path, only: Sequence[str], skipped: dict[str, str]) -> dict
     for language, build in (("csharp", native.build_csharp_server), ("c", native.build_c_server)):
         names = [f"session_{language}_{exchange}" for exchange in EXCHANGES]
         if only and not set(names) & set(only):
-            entries |= dict.fromkeys(names, entries[BASE])  # only their names are looked at
             continue
         try:
             command = build(folder)
@@ -161,9 +176,6 @@ def _entries(folder: Path, only: Sequence[str], skipped: dict[str, str]) -> dict
         entries[f"session_{exchange}{ONE_CORE}"] = Entry(partial(trips.session, one, exchange), one)
     for name in (BASE, "pipe", "semaphores"):
         entries[f"{name}{ONE_CORE}"] = Entry(entries[name].way, one)
-    unknown = [name for name in only if name not in entries and name not in skipped]
-    if unknown:
-        raise CosimError(f"--only: expected some of {', '.join(entries)}, found {unknown[0]!r}")
     chosen = {name: entry for name, entry in entries.items() if not only or name in only}
     if len(both) < 2:
         for name in [name for name, entry in chosen.items() if entry.cores is both]:
@@ -185,7 +197,7 @@ def _round_trips(
                 with trips.pinned(entry.cores), entry.way() as exchange:
                     samples = trips.time_exchanges(exchange, effort.samples, effort.seconds)
             except ImportError as error:
-                skipped[name] = f"{error.name} is not installed: pip install 'tube-cosim[bench]'"
+                skipped[name] = f"{error.name} is not installed: {install_command('bench')}"
                 continue
             except (CosimError, ProtocolError) as error:
                 skipped[name] = str(error)

@@ -12,6 +12,7 @@ from typing import Any, Final
 import click
 
 from cosim.errors import PEER
+from cosim.protocol_bars import WAYS
 from cosim.screens import EXIT_FAILED_CHECK, command, json_option, option
 
 PROGRAM: Final = "cosim"
@@ -115,11 +116,19 @@ def doctor(clean: bool, as_json: bool) -> None:
 @json_option
 @option("--quick", is_flag=True, help="Fewer samples: a look, not a measurement.")
 @option("--training", is_flag=True, help="The speed of training instead: environment, PPO, past the paper.")
-@option("--protocol", is_flag=True, help="The protocol instead: against the field, the floor, idle, lanes.")
+@option(
+    "--protocol",
+    is_flag=True,
+    help="The protocol instead: against the field, the floor, lanes, observers, bars.",
+)
 @option(
     "--png", type=click.Path(path_type=Path), metavar="FILE", help="With --protocol: draw all round trips."
 )
-@option("--only", metavar="A,B,...", help="With --protocol: these ways alone [default: all].")
+@option(
+    "--only",
+    metavar="A,B,...",
+    help=f"With --protocol: these ways alone, out of {', '.join(WAYS)} [default: all].",
+)
 def bench(
     as_json: bool, quick: bool, training: bool, protocol: bool, png: Path | None, only: str | None
 ) -> None:

@@ -20,7 +20,7 @@ from typing import Final
 
 import click
 
-from cosim.requirements import Requirement, install_target, is_checkout, read_requirements
+from cosim.requirements import Requirement, install_command, is_checkout, read_requirements
 from protocol.compiled_choice import AUTO, COMPILED, ENVIRONMENT, STDLIB
 from protocol.errors import SessionError
 from protocol.layout import command_bytes, pose_bytes
@@ -128,10 +128,10 @@ def check_packages(requirements: dict[str, tuple[Requirement, ...]]) -> Iterator
         if not wrong:
             yield Check(name, Level.OK, found)
         elif extra:
-            advice = f"optional: pip install '{install_target()}[{extra}]'"
+            advice = f"optional: {install_command(extra)}"
             yield Check(name, Level.WARN, found, advice)
         else:
-            yield Check(name, Level.FAIL, found, f"pip install '{install_target()}'")
+            yield Check(name, Level.FAIL, found, install_command())
 
 
 def check_shared_memory() -> Check:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from cosim.errors import CosimError, OutputError
+from cosim.requirements import install_command
 from cosim.round_trip import Samples
 
 BINS = 120
@@ -69,6 +70,6 @@ def _matplotlib() -> tuple[Any, Any]:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise CosimError(
-            f"--png needs {error.name}; install the extra with: pip install 'tube-cosim[bench]'"
+            f"--png needs {error.name}; install the extra with: {install_command('bench')}"
         ) from error
     return FigureCanvasAgg, Figure

@@ -2,7 +2,7 @@
 
 One process looks on at a rate that is changed every few thousand round trips, in turn, so that whatever else the
 machine does falls on all rates alike. Agent and physics process have a core each where there are two; the observer
-is left to the scheduler, as `cosim watch` is.
+is left to the scheduler, as `cosim watch` is. A part of `cosim bench --protocol`.
 """
 
 from __future__ import annotations
@@ -11,22 +11,16 @@ import math
 import multiprocessing
 import os
 import statistics
-import sys
-import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from cosim.supervise import PhysicsProcess
+from cosim import round_trip as trips
 from cosim.watch import step_back
-from protocol.agent import AgentSession, SessionSettings
 from protocol.observer import Observer
-from protocol.plant import CommandBatch, Floats, ResetBatch
 
 RATES: Final = {"none": 0.0, "20_hz": 20.0, "60_hz": 60.0, "full_speed": math.inf}
 """Looks a second, by name."""
@@ -36,7 +30,9 @@ _BURST: Final = 50
 """Looks at full speed between two looks at what to do next."""
 
 
-def measure_observer(samples: int, repeats: int) -> dict[str, dict[str, float]]:
+def measure_observer(
+    samples: int, repeats: int, seconds: float = 1e6, exchange: str | None = None
+) -> dict[str, Figures]:
     """Round-trip times by the observer's rate, medians over the repeats, and their ratio to those without.
 
     The median round trip tells what an observer costs; mean and p99 also hold what it takes of the cores.
@@ -44,31 +40,33 @@ def measure_observer(samples: int, repeats: int) -> dict[str, dict[str, float]]:
     Args:
         samples: round trips of one repeat at one rate; they should last longer than 50 ms.
         repeats: how often the rates are gone through in turn.
+        seconds: time for one repeat at one rate, at most.
+        exchange: as `round_trip.session`.
+
+    Returns:
+        By the name of the rate: p50_us, p99_us, mean_us, looks_per_s, p50_ratio, p99_ratio, mean_ratio.
     """
     found: dict[str, list[Figures]] = {name: [] for name in RATES}
-    with _session() as (exchange, rendezvous, server), _observer(rendezvous) as look_on, _apart(server):
+    cores = trips.two_cores()
+    rendezvous = trips.new_rendezvous()
+    everywhere = os.sched_getaffinity(0)
+    with (
+        trips.open_session(cores, 1, exchange, rendezvous=rendezvous) as (agent, _),
+        _observer(rendezvous, sorted(everywhere)) as look_on,
+    ):
+        agent.reset(trips.sound_resets(agent))
+        commands = trips.sound_commands(1)
         for repeat in range(repeats + 1):
             for name, rate in RATES.items():
                 look_on(rate)
-                times = _times(exchange, samples)
+                times = trips.time_exchanges(lambda: agent.step(commands), samples, seconds)
                 looks = look_on(0.0)
                 if repeat > 0:  # the first round warms up
                     found[name].append(_figures(times, looks))
     return {name: _summary(rows, found["none"]) for name, rows in found.items()}
 
 
-def _times(exchange: Callable[[], object], samples: int) -> Floats:
-    """Round-trip times (us), (samples,)."""
-    clock = time.perf_counter_ns
-    taken = np.empty(samples)
-    for i in range(samples):
-        started = clock()
-        exchange()
-        taken[i] = clock() - started
-    return taken / 1e3
-
-
-def _figures(times: Floats, looks: int) -> Figures:
+def _figures(times: trips.Samples, looks: int) -> Figures:
     p50, p99 = np.quantile(times, (0.5, 0.99))
     per_second = 1e6 * looks / float(times.sum())
     return {
@@ -91,41 +89,11 @@ def _summary(rows: list[Figures], alone: list[Figures]) -> Figures:
 
 
 @contextmanager
-def _session() -> Iterator[tuple[Callable[[], object], str, int]]:
-    """A session with an engine that does nothing; yields one exchange, the rendezvous, and the server's pid."""
-    rendezvous = f"shm:cosim-observed-{os.getpid()}-{time.monotonic_ns()}"
-    command = [sys.executable, "-m", "physics_server", "--engine", "null"]
-    with (
-        tempfile.TemporaryDirectory(prefix="cosim-bench-") as folder,
-        PhysicsProcess(command, rendezvous, Path(folder)) as server,
-        AgentSession.open(rendezvous, SessionSettings(1, 0.1, 1.0 / 240.0), watch=server.watch) as session,
-    ):
-        resets, commands = ResetBatch.zeros(1), CommandBatch.zeros(1)
-        resets.selected[0] = 1
-        resets.parameters[0, : len(session.description.defaults)] = session.description.defaults
-        commands.direction[0, 0], commands.speed[0], commands.compensation[0] = 1.0, 1.0, 1.0
-        session.reset(resets)
-        yield lambda: session.step(commands), rendezvous, server.pid
-
-
-@contextmanager
-def _apart(server: int) -> Iterator[None]:
-    """This process and the server on a core each, where there are two."""
-    cores = sorted(os.sched_getaffinity(0))
-    os.sched_setaffinity(server, cores[-1:])
-    os.sched_setaffinity(0, cores[:1])
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, cores)
-
-
-@contextmanager
-def _observer(rendezvous: str) -> Iterator[Callable[[float], int]]:
+def _observer(rendezvous: str, cores: Sequence[int]) -> Iterator[Callable[[float], int]]:
     """A process that looks on; yields what sets its rate and returns its looks at the rate before."""
     ours, theirs = multiprocessing.get_context("spawn").Pipe()
     process = multiprocessing.get_context("spawn").Process(
-        target=_look_on, args=(theirs, rendezvous), daemon=True
+        target=_look_on, args=(theirs, rendezvous, cores), daemon=True
     )
     process.start()
     theirs.close()
@@ -144,8 +112,9 @@ def _observer(rendezvous: str) -> Iterator[Callable[[float], int]]:
             process.join()
 
 
-def _look_on(connection: Connection[Any, Any], rendezvous: str) -> None:
+def _look_on(connection: Connection[Any, Any], rendezvous: str, cores: Sequence[int]) -> None:
     looks = 0
+    os.sched_setaffinity(0, cores)
     step_back()
     with connection, Observer.attach(rendezvous) as observer:
         try:

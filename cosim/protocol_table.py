@@ -33,6 +33,14 @@ def protocol_table(figures: dict[str, Any]) -> str:
             "",
             f"a waiting pair: physics takes {idle['physics']:.2f} % of a core, the agent {idle['agent']:.2f} %",
         ]
+    if "observer" in figures:
+        lines += ["", *_observer_lines(figures["observer"])]
+    if figures["bars"]:
+        width = max(len(row["name"]) for row in figures["bars"])
+        lines += ["", "the project's own bars"]
+        for row in figures["bars"]:
+            verdict = "reached" if row["reached"] else "missed"
+            lines.append(f"  {row['name']:<{width}}{row['found']:9.2f}  of {row['bar']:.2f}  {verdict}")
     if figures["skipped"]:
         lines += ["", "not measured:", *(f"  {name}: {why}" for name, why in figures["skipped"].items())]
     return "\n".join(lines)
@@ -50,6 +58,18 @@ def _lane_lines(lanes: dict[str, list[dict[str, float]]]) -> list[str]:
                 f"{row['transport_us']:11.2f}{row['transport_us_per_lane']:10.3f}"
                 f"{row['transport_over_one_lane']:18.2f}{row['steps_per_second_per_lane']:16.0f}"
             )
+    return lines
+
+
+def _observer_lines(rates: dict[str, dict[str, float]]) -> list[str]:
+    lines = [
+        f"{'one lane, and who looks on (us)':<40}{'p50':>9}{'p99':>10}{'looks/s':>11}{'p50 over none':>18}"
+    ]
+    for name, row in rates.items():
+        lines.append(
+            f"  {name:<38}{row['p50_us']:9.2f}{row['p99_us']:10.2f}{row['looks_per_s']:11.0f}"
+            f"{row['p50_ratio']:18.2f}"
+        )
     return lines
 
 

@@ -66,6 +66,11 @@ def install_target() -> str:
     return "." if is_checkout() else DISTRIBUTION
 
 
+def install_command(extra: str = "") -> str:
+    """The command that installs the project, with one of its extras if one is named."""
+    return f"pip install '{install_target()}{f'[{extra}]' if extra else ''}'"
+
+
 def _look_up(line: str) -> Requirement:
     match = _REQUIREMENT.match(line)
     assert match is not None  # the project's own description

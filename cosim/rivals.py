@@ -239,7 +239,7 @@ def pybullet_server() -> Iterator[Exchange]:
     p: Any = bullet_world.pybullet  # type: ignore[attr-defined]  # its one importer
     ours, theirs = multiprocessing.get_context("spawn").Pipe()
     key = 0x7C000000 + os.getpid() % 0xFFFFFF
-    with _stdout_to_stderr(), child(_pybullet_peer, key, theirs, patience=PATIENCE_S), ours:
+    with _without_stdout(), child(_pybullet_peer, key, theirs, patience=PATIENCE_S), ours:
         theirs.close()
         ours.recv_bytes()
         client = p.connect(p.SHARED_MEMORY, key=key)
@@ -261,7 +261,6 @@ def pybullet_server() -> Iterator[Exchange]:
 
 def _pybullet_peer(key: int, connection: Connection) -> None:
     """Serve until the other end of the connection is closed; an orderly end alone removes its shared memory."""
-    os.dup2(sys.stderr.fileno(), 1)
     p: Any = bullet_world.pybullet  # type: ignore[attr-defined]
     server = p.connect(p.SHARED_MEMORY_SERVER, key=key)
     connection.send_bytes(_READY)
@@ -279,13 +278,16 @@ def _until_closed(connection: Connection) -> None:
 
 
 @contextmanager
-def _stdout_to_stderr() -> Iterator[None]:
-    """Keep what an engine prints from C out of our stdout, which may be one JSON object."""
+def _without_stdout() -> Iterator[None]:
+    """Throw away what an engine prints from C, here and in processes that are started meanwhile."""
     sys.stdout.flush()
     kept = os.dup(1)
-    os.dup2(sys.stderr.fileno(), 1)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.close(nowhere)
     try:
         yield
     finally:
+        ctypes.CDLL(None).fflush(None)  # C keeps what it prints until later, where nobody reads along
         os.dup2(kept, 1)
         os.close(kept)

@@ -37,6 +37,8 @@ ZEROS: Final = (0.0,) * (POSE_WORDS - COMMAND_WORDS)
 """What a peer adds to a command to answer it."""
 
 DT: Final = 0.1
+LEAST: Final = 25
+"""Round trips that a repeat has at least, however long they take: a median of fewer is an accident."""
 PATIENCE_S: Final = 5.0
 """How long a peer may take to end by itself."""
 
@@ -82,7 +84,7 @@ def time_exchanges(exchange: Exchange, samples: int, seconds: float = 1e6) -> Sa
     Args:
         exchange: makes one.
         samples: how many, at most.
-        seconds: how long to measure, at most, and a fifth of that to warm up.
+        seconds: how long to measure, at most, and a fifth of that to warm up; LEAST round trips in any case.
     """
     clock = time.perf_counter_ns
     taken = np.empty(samples)
@@ -97,7 +99,7 @@ def time_exchanges(exchange: Exchange, samples: int, seconds: float = 1e6) -> Sa
         exchange()
         ended = clock()
         taken[i] = ended - started
-        if ended > until:
+        if ended > until and i + 1 >= LEAST:
             return taken[: i + 1] / 1e3
     return taken / 1e3
 
@@ -150,10 +152,14 @@ def session(
 
 @contextmanager
 def open_session(
-    cores: Sequence[int], lanes: int, exchange: str | None = None, command: Sequence[str] | None = None
+    cores: Sequence[int],
+    lanes: int,
+    exchange: str | None = None,
+    command: Sequence[str] | None = None,
+    rendezvous: str | None = None,
 ) -> Iterator[tuple[AgentSession, PhysicsProcess]]:
-    """A session of so many lanes, as `session` has one, and its physics process."""
-    rendezvous = f"shm:cosim-bench-{os.getpid()}-{time.monotonic_ns()}"
+    """A session of so many lanes, as `session` has one, and its physics process; at a new rendezvous if at None."""
+    rendezvous = rendezvous or new_rendezvous()
     # One inner step a control step: the time of an engine is not what is measured.
     settings = SessionSettings(lanes, DT, DT)
     command = command or (*physics_command(None), "--engine", "null")
@@ -171,6 +177,11 @@ def open_session(
             yield agent, server
         finally:
             os.sched_setaffinity(0, before)
+
+
+def new_rendezvous() -> str:
+    """A rendezvous that nobody has."""
+    return f"shm:cosim-bench-{os.getpid()}-{time.monotonic_ns()}"
 
 
 @contextmanager

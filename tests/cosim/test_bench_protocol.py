@@ -11,12 +11,15 @@ import pytest
 from click.testing import CliRunner
 
 from cosim import native
-from cosim.bench_protocol import LANES, LOOK, Effort, _lanes, measure_protocol
+from cosim.bench_protocol import LANES, LOOK, Effort, _entries, _lanes, measure_protocol
 from cosim.cli import cosim
 from cosim.errors import CosimError, OutputError
 from cosim.idle import idle_percent
+from cosim.observer_cost import RATES
+from cosim.protocol_bars import WAYS, judge
 from cosim.protocol_table import protocol_table
-from cosim.round_trip import two_cores
+from cosim.requirements import install_command
+from cosim.round_trip import LEAST, time_exchanges, two_cores
 
 BRIEF = Effort(samples=80, seconds=0.05, repeats=1, idle_s=0.1)
 
@@ -47,7 +50,7 @@ def test_the_command_prints_one_json_object_of_the_documented_fields(tmp_path: P
     done = CliRunner().invoke(cosim, arguments)
     assert done.exit_code == 0, done.output
     figures = json.loads(done.stdout)
-    assert set(figures) == {"machine", "effort", "round_trip", "skipped", "png"}
+    assert set(figures) == {"machine", "effort", "round_trip", "bars", "skipped", "png"}
     assert set(figures["round_trip"]) == {"session_stdlib", "udp"}
     for row in figures["round_trip"].values():
         assert 0 < row["p50_us"] <= row["p99_us"] <= row["p999_us"]
@@ -55,7 +58,54 @@ def test_the_command_prints_one_json_object_of_the_documented_fields(tmp_path: P
     expected = trips["session_stdlib"]["p50_us"] / trips["udp"]["p50_us"]
     assert trips["session_stdlib"]["over_udp"] == pytest.approx(expected, abs=1e-3)
     assert picture.read_bytes().startswith(b"\x89PNG")
-    assert "session_stdlib" in protocol_table(figures)
+    over_udp, spread = figures["bars"]
+    assert (over_udp["found"], over_udp["bar"]) == (trips["session_stdlib"]["over_udp"], 0.55)
+    assert spread["found"] == pytest.approx(
+        trips["session_stdlib"]["p99_us"] / trips["session_stdlib"]["p50_us"], abs=1e-3
+    )
+    for row in figures["bars"]:
+        assert row["reached"] == (row["found"] <= row["bar"])
+        assert ("reached" if row["reached"] else "missed") in protocol_table(figures)
+
+
+def test_a_bar_is_judged_where_its_figure_was_measured() -> None:
+    """Each bar of the project stands beside its figure; on the bar is reached, but lanes have to be below it."""
+    lanes = [{"lanes": 1, "transport_over_one_lane": 1.0}, {"lanes": 64, "transport_over_one_lane": 4.0}]
+    found = judge(
+        {
+            "round_trip": {
+                "session_csharp_compiled": {"p50_us": 2.0, "p99_us": 9.0, "over_udp": 0.35},
+                "session_compiled": {"p50_us": 2.0, "p99_us": 3.1, "over_udp": 0.36},
+                "udp": {"p50_us": 5.0, "p99_us": 9.0, "over_udp": 1.0},
+            },
+            "lanes": {"stdlib": lanes},
+            "observer": {name: {"p50_ratio": 1.1} for name in RATES},
+        }
+    )
+    assert [(bar.name.split(":")[0], bar.found, bar.bar, bar.reached) for bar in found] == [
+        ("session_compiled", 0.36, 0.35, False),
+        ("session_csharp_compiled", 0.35, 0.35, True),
+        ("session_compiled", 1.55, 1.5, False),
+        ("session_stdlib", 4.0, 4.0, False),
+        ("observer 20_hz", 1.1, 1.1, True),
+        ("observer 60_hz", 1.1, 1.1, True),
+    ]
+    assert judge({"round_trip": {}}) == []
+
+
+def test_the_help_names_every_way_and_nothing_else(tmp_path: Path) -> None:
+    """--only offers the ways that are there."""
+    skipped: dict[str, str] = {}
+    entries = _entries(tmp_path, (), skipped)
+    assert set(entries) | set(skipped) == set(WAYS)
+    done = CliRunner().invoke(cosim, ["bench", "--help"])
+    assert all(name in done.output for name in WAYS)
+
+
+def test_slow_round_trips_are_still_enough_for_a_median() -> None:
+    """However little time there is, a repeat has as many as a median needs."""
+    assert len(time_exchanges(lambda: None, 1000, seconds=0.0)) == LEAST
+    assert len(time_exchanges(lambda: None, 3, seconds=0.0)) == 3
 
 
 def test_options_that_do_not_fit_are_refused(tmp_path: Path) -> None:
@@ -76,17 +126,20 @@ def test_a_library_that_is_missing_is_said(monkeypatch: pytest.MonkeyPatch) -> N
         monkeypatch.setitem(sys.modules, name, None)
     figures, samples = measure_protocol(BRIEF, ("pyzmq", "iceoryx2", "grpc_unary"), silent)
     assert set(figures["skipped"]) == {"pyzmq", "iceoryx2", "grpc_unary"}
-    assert all("pip install 'tube-cosim[bench]'" in why for why in figures["skipped"].values())
+    assert all(install_command("bench") in why for why in figures["skipped"].values())
     assert samples == {}
     assert "not measured:" in protocol_table(figures)
 
 
 @needs_two_cores
-def test_every_way_of_the_standard_library_and_of_pybullet_makes_round_trips() -> None:
-    """They measure what they are asked to and leave no process behind."""
+def test_every_way_of_the_standard_library_and_of_pybullet_makes_round_trips(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """They measure what they are asked to, leave no process behind, and print nothing from C."""
     names = ("pipe", "semaphores", "udp_polling", "pybullet_server")
     figures, samples = measure_protocol(BRIEF, names, silent)
     assert figures["skipped"] == {}
+    assert capfd.readouterr() == ("", "")
     assert set(samples) == set(names)
     assert all((rows > 0).all() and len(rows) for rows in samples.values())
 
