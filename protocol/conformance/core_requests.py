@@ -25,7 +25,7 @@ from protocol.conformance.sound import (
     take_box,
     write_box,
 )
-from protocol.layout import Axes
+from protocol.layout import TUBE_SLOTS_MAX, Axes
 from protocol.plant import NO_TUBE, PARAMETER_INDEX, CommandBatch, PoseBatch, ResetBatch
 
 ROUNDED: Final = 1e-5
@@ -145,6 +145,20 @@ def pose_time(rig: Rig) -> None:
     done(agent.reset(resets(agent)), "a reset")
     for step, poses in enumerate(fly(agent, commands(agent), 12), start=1):
         expect(f"sim_time of step {step}", float(poses.sim_time[0]), step * agent.settings.dt)
+
+
+@server_rule("tube-last-index", Level.CORE, "6", f"of {TUBE_SLOTS_MAX} tube slots the last one takes a tube")
+def tube_last_index(rig: Rig) -> None:
+    """A lane is reset into it and flies there, and it is released."""
+    agent = rig.open(tube_slots=TUBE_SLOTS_MAX)
+    index = TUBE_SLOTS_MAX - 1
+    take_box(agent, rig.folder, index)
+    batch = resets(agent)
+    batch.tube[:] = index
+    done(agent.reset(batch), f"a reset into tube {index}")
+    fly(agent, commands(agent), 1)
+    done(agent.reset(resets(agent)), "a reset out of it")
+    done(release(agent, index), f"the release of tube {index}")
 
 
 @server_rule("tube-release-again", Level.CORE, "6", "a released index can be registered again")

@@ -9,7 +9,7 @@ import numpy as np
 
 from protocol.conformance.raw_agent import RawAgent
 from protocol.conformance.rig import Rig
-from protocol.conformance.rule import Level, Skip, demand, expect, server_rule
+from protocol.conformance.rule import Level, Silence, Skip, demand, expect, server_rule
 from protocol.conformance.sound import (
     AT_REST,
     close_to,
@@ -28,6 +28,8 @@ from protocol.plant import PARAMETER_INDEX, CommandBatch, PoseBatch, ResetBatch
 
 COUNTS: Final = (1, 2, 7, 64)
 """Numbers of lanes that the rules open."""
+CROWD: Final = 1000
+"""Lanes of the rule that there may be many."""
 _TOLERANCE: Final = 1e-4
 
 
@@ -112,6 +114,28 @@ for _lanes in COUNTS:
     _rows(_lanes)
     if _lanes > 1:
         _alone(_lanes)
+
+
+@server_rule(
+    "many-lanes", Level.LANES, "3", f"{CROWD} lanes attach, are reset and step once, each with its own row"
+)
+def many_lanes(rig: Rig) -> None:
+    """Nothing acts on the bodies; each flies on at a velocity of its own, the first and the last as all between."""
+    try:
+        agent = rig.open(lanes=CROWD, inner_steps=1)
+    except Silence as silence:  # an engine may need seconds for so many worlds: no rule says how long
+        raise Skip(f"with {CROWD} lanes {silence}; give it longer by --timeout") from silence
+    batch = resets(agent, **AT_REST)
+    batch.position[:, 1] = np.arange(CROWD)
+    batch.linear_velocity[:, 0] = np.arange(CROWD) / CROWD
+    placed = done(agent.reset(batch), f"a reset of {CROWD} lanes")
+    close_to("positions after a reset", placed.position.ravel(), batch.position.ravel(), _TOLERANCE)
+    poses = done(agent.step(commands(agent)), f"a step of {CROWD} lanes")
+    expected = batch.position + agent.settings.dt * batch.linear_velocity
+    off = np.abs(poses.position - expected).max(axis=1)
+    lane = int(np.argmax(np.where(np.isnan(off), np.inf, off)))
+    close_to(f"position of lane {lane} after a step", poses.position[lane], expected[lane], _TOLERANCE)
+    expect("lanes whose step is 1", int((poses.step == 1).sum()), CROWD)
 
 
 @server_rule(

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from protocol import handshake, layout
-from protocol.conformance.rule import Failure
-from protocol.errors import PeerLost, ProtocolError
+from protocol.conformance.rule import Failure, Silence
+from protocol.errors import PeerLost, ProtocolError, Verdict
 from protocol.handshake import Offer, SessionSettings, read_farewell
 from protocol.layout import COMMAND, COMMAND_MAGIC, POSE, POSE_MAGIC, Field, Op, Status
 from protocol.liveness import start_time
@@ -130,7 +130,7 @@ class RawAgent:
                 look_at = now + LOOK_S
                 self._demand_life("a header")
             if now - began > patience:
-                raise Failure("the server", f"a header within {patience:g} s", "none, though it runs")
+                raise Silence("the server", f"a header within {patience:g} s", "none, though it runs")
             time.sleep(POLL_S)
         if FENCE is not None:
             FENCE()
@@ -220,7 +220,8 @@ class RawAgent:
             self._waiter(self.number - 1, self.steps, "a reply")
         except ProtocolError as error:
             found = error.how if isinstance(error, PeerLost) else str(error)
-            raise Failure("the server", f"a reply to request {self.number}", found) from error
+            kind = Silence if isinstance(error, PeerLost) and error.verdict is Verdict.TOO_SLOW else Failure
+            raise kind("the server", f"a reply to request {self.number}", found) from error
 
     def reply(self) -> Reply:
         """Read the reply as it stands now."""

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from protocol.conformance.rig import PeerProcess
-from protocol.conformance.rule import Failure
+from protocol.conformance.rule import Failure, Silence
 from protocol.conformance.stand_in import StandIn
 from protocol.errors import Refusal, RefusalCode
 from protocol.handshake import magic, read_farewell, write_farewell
@@ -249,7 +249,7 @@ class RawPhysics:
         if ended is not None:
             raise Failure(what, "a request", f"its end without a goodbye, {ended}")
         if waited > self.timeout:
-            raise Failure(what, f"a request within {self.timeout:g} s", "none, though it runs")
+            raise Silence(what, f"a request within {self.timeout:g} s", "none, though it runs")
 
     def serve_until(self, wanted: Callable[[Request], bool]) -> Request | None:
         """Answer soundly until a request is wanted, which is returned unanswered; None where a goodbye came first.
@@ -353,7 +353,7 @@ def _await_offer(rendezvous: str, process: PeerProcess, timeout: float) -> tuple
         if ended is not None:
             raise Failure("the agent", f"a session offered at {rendezvous}", f"its end, {ended}")
         if time.monotonic() > until:
-            raise Failure("the agent", f"a session offered at {rendezvous} within {timeout:g} s", "none")
+            raise Silence("the agent", f"a session offered at {rendezvous} within {timeout:g} s", "none")
         time.sleep(5 * POLL_S)
 
 

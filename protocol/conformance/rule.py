@@ -1,6 +1,7 @@
 """What a rule is: a name, where the specification says it, and a check that is run against a started peer.
 
     Failure     the peer broke the rule
+    Silence     it did so by saying nothing until its time was out
     Skip        the rule cannot be shown on this peer; says why
 
 A module of rules registers its checks by `server_rule` or `agent_rule`; `run.py` runs what is registered.
@@ -74,6 +75,8 @@ class Result:
     last_words: str
     """What a failed peer wrote to stdout and stderr, its end."""
     seconds: float
+    silent: bool = False
+    """Whether it failed because the peer, which ran, said nothing until its time was out."""
 
 
 class Failure(Exception):  # noqa: N818  the kit's own word
@@ -84,6 +87,10 @@ class Failure(Exception):  # noqa: N818  the kit's own word
         self.expected = str(expected)
         self.found = str(found)
         super().__init__(f"{what}: expected {expected}, found {found}")
+
+
+class Silence(Failure):
+    """The peer runs and said nothing for as long as it is waited for."""
 
 
 class Skip(Exception):  # noqa: N818  the kit's own word

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+import traceback
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -25,12 +27,24 @@ from protocol.conformance import (  # noqa: F401
     violations,
 )
 from protocol.conformance.rig import Rig
-from protocol.conformance.rule import AGENT_RULES, SERVER_RULES, Failure, Level, Outcome, Result, Rule, Skip
+from protocol.conformance.rule import (
+    AGENT_RULES,
+    SERVER_RULES,
+    Failure,
+    Level,
+    Outcome,
+    Result,
+    Rule,
+    Silence,
+    Skip,
+)
 from protocol.handshake import magic
 
 RULES: Final[dict[str, dict[str, Rule]]] = {"server": SERVER_RULES, "agent": AGENT_RULES}
 """All rules by the side that has to keep them, then by name."""
 
+PATIENCE: Final = 3
+"""How many rules in a row may end in silence before the rest is not tried."""
 TIMEOUT_S: Final = 10.0
 """How long a peer may take to start, or to answer, if nobody says otherwise."""
 
@@ -67,7 +81,7 @@ def run_rule(rule: Rule, command: str, transport: str = "shm", timeout: float = 
         timeout: how long the peer may take to start, or to answer (s).
     """
     began = time.perf_counter()
-    outcome, details, last_words = Outcome.PASSED, "", ""
+    outcome, details, last_words, silent = Outcome.PASSED, "", "", False
     with np.errstate(all="ignore"), Rig(command, transport, timeout) as rig:  # a peer may answer anything
         try:
             details = rule.check(rig) or ""
@@ -75,7 +89,18 @@ def run_rule(rule: Rule, command: str, transport: str = "shm", timeout: float = 
             outcome, details = Outcome.SKIPPED, str(skip)
         except Failure as failure:
             outcome, details, last_words = Outcome.FAILED, str(failure), rig.last_words()
-    return Result(rule, outcome, details, last_words, time.perf_counter() - began)
+            silent = isinstance(failure, Silence)
+        except Exception as error:  # noqa: BLE001  whatever the peer did, the other rules are still to be run
+            details = f"a fault of the kit, not of the peer (please report it): {_in_words(error)}"
+            outcome, last_words = Outcome.FAILED, rig.last_words()
+    return Result(rule, outcome, details, last_words, time.perf_counter() - began, silent)
+
+
+def _in_words(error: Exception) -> str:
+    """Put an exception that nobody expected into one line: its type and text, and where it came from."""
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f", in {Path(frames[-1].filename).name}, line {frames[-1].lineno}" if frames else ""
+    return f"{type(error).__name__}: {error}{where}"
 
 
 def run_suite(
@@ -84,11 +109,12 @@ def run_suite(
     transport: str = "shm",
     timeout: float = TIMEOUT_S,
     on_start: Callable[[Rule], None] | None = None,
+    on_end: Callable[[Result], None] | None = None,
 ) -> list[Result]:
-    """Run rules one after the other; `on_start` hears of each before it runs.
+    """Run rules one after the other; `on_start` hears of each before it runs, `on_end` of how it ended.
 
     The arguments are those of `run_rule`. Where nothing ever attaches, the rules fail without being tried: each
-    would wait for as long as the first.
+    would wait for as long as the first. So do those behind `PATIENCE` in a row whose peer, which ran, said nothing.
     """
     rules = list(rules)
     worth_it = len(rules) > 1 and rules[0] in SERVER_RULES.values()
@@ -98,9 +124,15 @@ def run_suite(
         if on_start is not None:
             on_start(rule)
         if silence is not None:
-            results.append(Result(rule, Outcome.FAILED, *silence, seconds=0.0))
+            result = Result(rule, Outcome.FAILED, *silence, seconds=0.0)
         else:
-            results.append(run_rule(rule, command, transport, timeout))
+            result = run_rule(rule, command, transport, timeout)
+        results.append(result)
+        if on_end is not None:
+            on_end(result)
+        tried = [each.silent for each in results if each.outcome is not Outcome.SKIPPED][-PATIENCE:]
+        if silence is None and tried == [True] * PATIENCE:
+            silence = f"not tried, after {PATIENCE} rules in a row without an answer: {result.details}", ""
     return results
 
 

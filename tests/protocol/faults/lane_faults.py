@@ -18,6 +18,17 @@ class ForgetsTheLast(ToyPlant):
         super().step(commands, poses)
 
 
+@fault("many-lanes")
+class CountsInAByte(ToyPlant):
+    """Lanes are counted in eight bits: those beyond are never stepped."""
+
+    def step(self, commands: CommandBatch, poses: PoseBatch) -> None:
+        """Put back the rows behind the first 256."""
+        before = poses.raw[256:].copy()
+        super().step(commands, poses)
+        poses.raw[256:] = before
+
+
 @fault("alone-as-among-2", "alone-as-among-7", "alone-as-among-64")
 class Crowded(ToyPlant):
     """What others do is felt, in the last digits."""

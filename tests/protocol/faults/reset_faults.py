@@ -108,6 +108,16 @@ class SumOfTimes(Toy):
         poses.sim_time[:] = before + self._dt
 
 
+@fault("tube-last-index")
+class ShortIndex(Toy):
+    """A tube's index is kept in sixteen bits with a sign."""
+
+    def register_tube(self, index: int, tube: TubeReference) -> None:
+        """Refuse what does not fit."""
+        if index >= 1 << 15:
+            raise Refusal("tube_index", "at most 32767", str(index), code=RefusalCode.TUBE_SLOT)
+
+
 @fault("tube-release-again")
 class RemembersTubes(Toy):
     """An index that was released cannot be registered again."""

@@ -50,7 +50,7 @@ def slow_lanes() -> Plant:
 
     def publish(whole: Publish, session: PhysicsSession, status: int, engine_ns: int, number: int) -> None:
         if session.offer.settings.lanes > 1:
-            time.sleep(0.003)
+            time.sleep(0.01)
         whole(session, status, engine_ns, number)
 
     around_publish(publish)
