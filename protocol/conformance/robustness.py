@@ -36,7 +36,7 @@ from protocol.conformance.scenes import (
     stop,
 )
 from protocol.conformance.sound import resets
-from protocol.conformance.stand_in import StandIn
+from protocol.conformance.stand_in import StandIn, dead_process
 from protocol.handshake import owner, write_farewell
 from protocol.layout import Farewell
 from protocol.states import Event, State
@@ -154,6 +154,63 @@ def _newer_segments_kept(rig: Rig) -> None:
         for name in names:
             demand(name.exists(), name.suffix, "the newer segment of that name kept", "it was removed")
             name.unlink()
+
+
+@server_rule(
+    "names-under-lock",
+    ROBUSTNESS,
+    "2",
+    "the names of a dead agent's segments stay while another process holds the lock of the command segment",
+)
+def _names_under_lock(rig: Rig) -> None:
+    agent = rig.agent()
+    holder = hand_over(agent)
+    try:
+        pid, started = dead_process()
+        agent.offer(pid=pid, start_time=started)
+        server = rig.start()
+        time.sleep(LONG_PAUSE_S)
+        _both_stay(agent, "before a session")
+        expect("the end of a server that waits for the lock", server.watch(), None)
+    finally:
+        holder.close()
+    await_no_segments(rig.rendezvous, rig.timeout)  # it has looked again
+    with scene(rig, State.READY) as s:
+        s.stand_in.kill()
+        holder = StandIn(command_path(s.agent.rendezvous))
+        try:
+            s.go_on()
+            await_end(s.server, "after its agent died, though another holds the lock")
+            _both_stay(s.agent, s.where)
+        finally:
+            holder.close()
+
+
+def _both_stay(agent: RawAgent, where: str) -> None:
+    left = segments_left(agent.rendezvous)
+    demand(
+        len(left) == 2, f"segments of a dead agent {where}, locked by another", "both left to that one", left
+    )
+
+
+@server_rule(
+    "request-taken-first",
+    ROBUSTNESS,
+    "10",
+    "a request that was published before the agent died or said farewell is answered before the server leaves",
+)
+def _request_taken_first(rig: Rig) -> None:
+    for fault in ("died", "said farewell"):
+        with scene(rig, State.RESETTING) as s:
+            if fault == "died":
+                s.stand_in.kill()
+            else:
+                write_farewell(s.agent.command, Farewell.STOPPED, "it is a test of farewells")
+            s.go_on()
+            await_end(s.server, f"after its agent {fault} {s.where}")
+            expect(
+                f"the last reply to an agent that {fault} {s.where}", s.agent.get("doorbell"), s.agent.number
+            )
 
 
 # --- silence ---

@@ -127,6 +127,8 @@ class Server:
         looked = time.monotonic()
         bell = DOORBELL if keeps("slow-request-awaited") else BEGIN
         while not self.over:
+            if not keeps("request-taken-first"):
+                self.look()
             if self.command[bell] != self.number:
                 self.answer()
                 continue
@@ -144,7 +146,7 @@ class Server:
         ignored = () if keeps("agent-farewell") else (HANDSHAKE,)
         kind = self.command[FAREWELL]
         gone = (kind != 0 and kind not in ignored) or not alive(self.command)
-        if gone and self.command[DOORBELL] == self.number:
+        if gone and (self.command[DOORBELL] == self.number or not keeps("request-taken-first")):
             raise Left(STOPPED, "the agent is gone")
 
     def answer(self) -> None:
@@ -208,6 +210,11 @@ def leave(command: Segment, pose: Segment, over: bool) -> None:
     """Remove what a dead agent leaves behind."""
     if not alive(command) and not (over and not keeps("agent-killed")):
         whatever = not keeps("newer-segments-kept")
+        until = time.monotonic() + 0.5
+        while keeps("names-under-lock") and not command.lock():
+            if time.monotonic() > until:
+                return
+            time.sleep(0.005)
         pose.unlink(whatever_stands_there=whatever)
         command.unlink(whatever_stands_there=whatever)
 
