@@ -15,6 +15,10 @@ VIEW_ANGLE: Final = 30.0
 INSIDE_ANGLE: Final = 75.0
 """Of what is seen inside of a tube."""
 UP: Final = np.array([0.0, 0.0, 1.0])
+SIDE_MARGIN: Final = 0.11
+TOP_MARGIN: Final = 0.17
+BOTTOM_MARGIN: Final = 0.1
+"""Shares of the picture that an overview keeps free; texts stand at the top."""
 POINTS: Final = 1500
 """Of a tube, by which it is framed."""
 
@@ -42,13 +46,12 @@ class Camera:
     """What is nearer than this is left out (m)."""
 
 
-def overview(points: Floats, aspect: float, margin: float = 0.12) -> Camera:
+def overview(points: Floats, aspect: float) -> Camera:
     """The whole of some points (V, 3), from the side from which they spread widest over the picture.
 
     Args:
         points: of the tube (m).
         aspect: width over height of the picture.
-        margin: kept free at each side, as a share of the picture.
     """
     points = points[:: max(1, len(points) // POINTS)]
     apart = points - np.roll(points, len(points) // 2, axis=0)
@@ -58,7 +61,7 @@ def overview(points: Floats, aspect: float, margin: float = 0.12) -> Camera:
         for azimuth in np.radians(np.arange(0.0, 360.0, 15.0)):
             level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
             towards = -np.cos(elevation) * level - np.sin(elevation) * UP
-            distance, camera = _frame(points, towards, aspect, margin)
+            distance, camera = _frame(points, towards, aspect)
             seen = np.linalg.norm(apart - np.outer(apart @ towards, towards), axis=1).mean()
             # Large, not shortened, and not from steeply above, where a tube looks flat.
             score = float(seen / max(distance, 1e-9) * (seen / whole) * (1.0 - 0.4 * np.sin(elevation)))
@@ -101,20 +104,21 @@ def inside(position: Floats, axis_position: Floats, tangent: Floats, up: Floats,
     return Camera(place, position + 0.8 * radius * tangent, upward, angle=INSIDE_ANGLE)
 
 
-def _frame(points: Floats, towards: Floats, aspect: float, margin: float) -> tuple[float, Camera]:
+def _frame(points: Floats, towards: Floats, aspect: float) -> tuple[float, Camera]:
     """The nearest camera that looks `towards` and sees all points, and how far it is from their middle."""
     right = np.cross(towards, UP)
     right /= np.linalg.norm(right)
     up = np.cross(right, towards)
     x, y, z = points @ right, points @ up, points @ towards
-    tall = np.tan(np.radians(VIEW_ANGLE / 2)) * (1.0 - 2.0 * margin)
-    wide = np.tan(np.radians(VIEW_ANGLE / 2)) * aspect * (1.0 - 2.0 * margin)
+    half = float(np.tan(np.radians(VIEW_ANGLE / 2)))
+    wide, tall, deep = (half * (1.0 - 2.0 * margin) for margin in (SIDE_MARGIN, TOP_MARGIN, BOTTOM_MARGIN))
+    wide *= aspect
     # At depth z a camera at (a, b, c) sees |x - a| <= wide (z - c): each edge of the picture is a plane that
     # leans on the outermost point, and c is where two planes that face each other meet.
-    left_edge, right_edge = (x + wide * z).min(), (x - wide * z).max()
-    low_edge, high_edge = (y + tall * z).min(), (y - tall * z).max()
-    c = min((left_edge - right_edge) / (2 * wide), (low_edge - high_edge) / (2 * tall))
-    a, b = (left_edge + right_edge) / 2, (low_edge + high_edge) / 2
+    left, right_most = (x + wide * z).min(), (x - wide * z).max()
+    low, high = (y + deep * z).min(), (y - tall * z).max()
+    c = min((left - right_most) / (2.0 * wide), (low - high) / (tall + deep))
+    a, b = (left + right_most) / 2.0, (high + tall * c + low - deep * c) / 2.0
     middle = (z.min() + z.max()) / 2
     position = a * right + b * up + c * towards
     return float(middle - c), Camera(position, position + (middle - c) * towards, up)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.cameras import INSIDE_BACK, Camera, follow, inside, overview
+from cosim.drone_figure import frame_along
 from cosim.errors import ViewError
 from cosim.playback import AXIS_COLOUR, RIM_COLOUR, WALL_COLOUR, View
 from cosim.scene import Surface
@@ -24,6 +25,7 @@ from meshes.wall import read_wall
 if TYPE_CHECKING:
     from cosim.film import Image
     from cosim.vedo_scene import Stage
+    from meshes.openings import Opening  # at run time only where one is looked for
 
 Floats = NDArray[np.float64]
 
@@ -63,15 +65,26 @@ class MeshChoice:
         except CentrelineError as error:
             scale = None if isinstance(self.scale, MeanRadius) else self.scale
             wall = read_wall(path, self.axes, scale)
-            return ViewedMesh(
-                path, Surface(wall.vertices, wall.faces), None, None, (), f"no centreline is shown: {error}"
-            )
+            surface, note = Surface(wall.vertices, wall.faces), f"no centreline is shown: {error}"
+            return ViewedMesh(path, surface, None, None, self._openings(path), note)
         found = tube.found
-        openings = () if found is None else tuple((o.centre, o.outward, o.radius) for o in found.openings)
+        openings = () if found is None else found.openings
         note = "" if found is None else "the centreline shown was found from the mesh"
         return ViewedMesh(
             path, Surface(tube.wall.vertices, tube.wall.faces), tube.axis, tube.radius, openings, note
         )
+
+    def _openings(self, path: Path) -> tuple[Opening, ...]:
+        """The openings of a mesh that does not say which of them are meant; none where it has not as many."""
+        if self.entry is not None or self.exit is not None:
+            return ()
+        try:
+            tube = read_tube(path, None, self.axes, None, "first", 1, 2)
+        except CentrelineError:
+            return ()
+        assert tube.found is not None
+        factor = self.scale / tube.scale if isinstance(self.scale, float) else 1.0
+        return tuple(opening.scaled(factor) for opening in tube.found.openings)
 
 
 @dataclass(frozen=True)
@@ -84,8 +97,8 @@ class ViewedMesh:
     """Centreline (m), world frame; None where there is none."""
     radius: Floats | None  # (M,)
     """Local radius (m)."""
-    openings: tuple[tuple[Floats, Floats, float], ...]
-    """(centre, direction outwards, radius) of each that was found; numbered from 1."""
+    openings: tuple[Opening, ...]
+    """Those that were found; numbered from 1."""
     note: str
     """What a user should know; may be empty."""
 
@@ -106,8 +119,8 @@ def put_up_mesh(stage: Stage, mesh: ViewedMesh, view: View) -> None:
         length = float(np.linalg.norm(np.diff(mesh.axis, axis=0), axis=1).sum())
         size = f"centreline {length:.3g} m   radius {np.median(mesh.radius):.3g} m   {size}"
     if mesh.openings:
-        stage.lines([_ring(*opening) for opening in mesh.openings], OPENING_COLOUR, 3.0)
-        stage.numbers([centre + 0.3 * radius * out for centre, out, radius in mesh.openings], OPENING_COLOUR)
+        stage.lines([_ring(opening) for opening in mesh.openings], OPENING_COLOUR, 3.0)
+        stage.numbers([o.centre + 0.3 * o.radius * o.outward for o in mesh.openings], OPENING_COLOUR)
     stage.text(f"{mesh.path.name}\n{size}", "top-left")
     stage.look(_camera(mesh, view, stage.size))
 
@@ -123,7 +136,7 @@ def draw_figure(mesh: ViewedMesh, size: tuple[int, int], open_stage: Callable[..
     if mesh.axis is None:
         raise ViewError(f"--figure: expected a mesh with a centreline; {mesh.note}")
     width, height = size[0] // 2, size[1] // 2
-    camera = overview(mesh.surface.vertices, width / height, margin=0.08)
+    camera = overview(mesh.surface.vertices, width / height)
     panels = []
     for number, caption in enumerate(_PANELS):
         blender, line = number % 2 == 0, number >= 2
@@ -178,10 +191,9 @@ def _draw_floor(stage: Stage, vertices: Floats) -> None:
         stage.lines([np.array([[0.0, y[0], z], [0.0, y[-1], z]])], "#6a9a2d", 1.5)
 
 
-def _ring(centre: Floats, outward: Floats, radius: float) -> Floats:
-    least = np.eye(3)[int(np.argmin(np.abs(outward)))]
-    side = np.cross(outward, least)
-    side /= np.linalg.norm(side)
+def _ring(opening: Opening) -> Floats:
+    """A closed ring around an opening, (49, 3)."""
+    rotation = frame_along(opening.outward)
     angle = np.linspace(0.0, 2.0 * np.pi, 49)[:, None]
-    ring: Floats = centre + radius * (np.cos(angle) * side + np.sin(angle) * np.cross(outward, side))
-    return ring
+    around: Floats = np.cos(angle) * rotation[:, 1] + np.sin(angle) * rotation[:, 2]
+    return opening.centre + 1.05 * opening.radius * around

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cosim.cameras import INSIDE_BACK, Camera, follow, inside, overview
 from cosim.drone_figure import DroneFigure, Sighting
+from cosim.report_tube import simplify
 from cosim.scene import Surface
 from cosim.senses import local_frames
 from cosim.tracks import MAPS, TITLES, Quantity, Track
@@ -30,6 +31,8 @@ DRONE_COLOUR: Final = "#d9382f"
 RUN_COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Of several runs, in turn: told apart with any kind of colour vision."""
 
+TRIANGLES: Final = 400_000
+"""Of a wall that is drawn at most; rays are computed with all of them."""
 MOST_POINTS: Final = 4000
 """Of a trajectory that is drawn."""
 PATH_WIDTH: Final = 4.0
@@ -49,7 +52,7 @@ class Playback:
 
     def __init__(self, stage: Stage, tracks: Sequence[Track], *, colour: Quantity | None, view: View) -> None:
         self._stage, self._tracks = stage, tracks
-        self.view = view
+        self._view, self._turned = view, False
         self.leader = max(tracks, key=lambda track: float(track.scene.times[-1]))
         """The track whose records are the moments."""
         walls = _put_up(stage, tracks)
@@ -98,20 +101,32 @@ class Playback:
             self._say(self.leader.words(k))
         else:
             self._say("\n".join(track.brief(track.at(time)) for track in self._tracks))
-        self.look(k)
+        self._look(k)
 
-    def look(self, k: int) -> None:
-        """Put the camera where the view wants it at moment k."""
-        self._stage.look(self._camera(k))
+    @property
+    def view(self) -> View:
+        """Where the camera stands."""
+        return self._view
+
+    def change_view(self, view: View, k: int) -> None:
+        """Put the camera elsewhere, at moment k."""
+        self._view, self._turned = view, False
+        self._look(k)
+
+    def _look(self, k: int) -> None:
+        """Put the camera where the view wants it; an overview stays as the user has turned it."""
+        if self._view != "overview" or not self._turned:
+            self._stage.look(self._camera(k))
+        self._turned = True
 
     def _camera(self, k: int) -> Camera:
-        if self.view == "overview":
+        if self._view == "overview":
             return self._overview
         track = self.leader
         record = track.record(k)
         position, tangent = track.scene.positions[k], np.array(record["tangent"])
         radius = float(record["radius"])
-        if self.view == "follow":
+        if self._view == "follow":
             return follow(position, tangent, radius)
         behind = float(record["arc_length"]) - INSIDE_BACK * radius
         up = local_frames(position[None], track.scene.quaternions[k][None])[0, 1]
@@ -119,8 +134,10 @@ class Playback:
 
     def _draw_paths(self, quantity: Quantity | None, own: Sequence[str]) -> None:
         values = [] if quantity is None else [track.values(quantity) for track in self._tracks]
-        low = min((float(v.min()) for v in values), default=0.0)
-        high = max((float(v.max()) for v in values), default=1.0)
+        # The reward of the last step is worth all others together, and would leave them one colour.
+        share = 0.02 if quantity == "reward" else 0.0
+        low = min((float(np.quantile(v, share)) for v in values), default=0.0)
+        high = max((float(np.quantile(v, 1.0 - share)) for v in values), default=1.0)
         for i, track in enumerate(self._tracks):
             stride = max(1, -(-len(track.scene.positions) // MOST_POINTS))
             points = _moving(track.scene.positions[::stride])
@@ -150,8 +167,9 @@ def _put_up(stage: Stage, tracks: Sequence[Track]) -> dict[int, RayScene]:
         if same is None:
             same = RayScene(tube.vertices, tube.faces)
             shown.append((tube, same))
-            stage.wall(face_outwards(tube, track.scene.axis), WALL_COLOUR, cut=True)
-            stage.rims(tube, RIM_COLOUR)
+            drawn = simplify(tube, TRIANGLES) if len(tube.faces) > TRIANGLES else tube
+            stage.wall(face_outwards(drawn, track.scene.axis), WALL_COLOUR, cut=True)
+            stage.rims(drawn, RIM_COLOUR)
             stage.lines([track.scene.axis], AXIS_COLOUR, 2.0)
         walls[id(tube)] = same
     return walls

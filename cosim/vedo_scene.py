@@ -154,7 +154,11 @@ class Stage:
                 label_format=":.2f",
                 c=INK,
             )
-            self._plotter.add(line.scalarbar)
+            scale = line.scalarbar
+            scale.SetDrawBackground(True)
+            scale.GetBackgroundProperty().SetColor(1.0, 1.0, 1.0)
+            scale.GetBackgroundProperty().SetOpacity(0.55)
+            self._plotter.add(scale)
 
     def dot(self, colour: str, size: float) -> Shape:
         """Draw a round dot that is as large from everywhere (pixels), to be moved."""

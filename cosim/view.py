@@ -44,7 +44,7 @@ class ViewOptions:
     step: int | None = None
     """Of the picture, or where the window begins; None for the middle of the run, or its beginning."""
     camera: View | None = None
-    """None: the overview in pictures and windows."""
+    """None: the overview in pictures and windows, and along with the drone in films."""
     colour: Quantity | None = None
     realtime: float = 1.0
     """Pace of films and of playing."""
@@ -127,6 +127,7 @@ def _view_runs(options: ViewOptions, tracks: tuple[Track, ...]) -> None:
             playback.show(playback.last // 2 if options.step is None else options.step)
             _written(options.screenshot, stage.picture())
         if options.movie is not None:
+            playback.change_view(options.camera or "follow", 0)
             _film(options.movie, stage, playback, options.realtime)
         if not options.offscreen:
             from cosim.view_window import Controls

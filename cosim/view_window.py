@@ -80,8 +80,7 @@ class Controls:
     def change_view(self) -> None:
         """Put the camera to its next place."""
         now = VIEWS.index(self._playback.view)
-        self._playback.view = VIEWS[(now + 1) % len(VIEWS)]
-        self._playback.look(self.moment)
+        self._playback.change_view(VIEWS[(now + 1) % len(VIEWS)], self.moment)
         self._stage.draw()
 
     def advance(self, now: float) -> None:
