@@ -13,7 +13,7 @@ import click
 
 from cosim.errors import PEER
 from cosim.protocol_bars import WAYS
-from cosim.screens import EXIT_FAILED_CHECK, command, json_option, option
+from cosim.screens import EXIT_FAILED_CHECK, FiniteRange, command, json_option, option
 
 PROGRAM: Final = "cosim"
 
@@ -22,11 +22,11 @@ PROGRAM: Final = "cosim"
 @click.argument("session", required=False)
 @option(
     "--interval",
-    type=click.FloatRange(min=0.01),
+    type=FiniteRange(min=0.01),
     metavar="S",
     help="Between two reports [default: 0.1 on a terminal, else 1].",
 )
-@option("--wait", type=click.FloatRange(min=0.0), default=0.0, metavar="S", help="For a session to come.")
+@option("--wait", type=FiniteRange(min=0.0), default=0.0, metavar="S", help="For a session to come.")
 @option("--once", is_flag=True, help="One report, then the end.")
 @option("--json", "as_json", is_flag=True, help="One JSON object a line.")
 def watch(as_json: bool, **options: Any) -> None:
@@ -64,7 +64,7 @@ def watch(as_json: bool, **options: Any) -> None:
 @option("--rule", "names", metavar="NAME", multiple=True, help="This rule alone; may be repeated.")
 @option(
     "--timeout",
-    type=click.FloatRange(min=0.1, max=3600.0),
+    type=FiniteRange(min=0.1, max=3600.0),
     metavar="SECONDS",
     default=10.0,
     show_default=True,

@@ -7,14 +7,14 @@ import shlex
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import click
 
 from cosim.errors import OutputError, PeerCommandError
-from protocol.conformance.report import json_report, junit_report, text_report
+from protocol.conformance.report import SCHEMA, TextReport, json_report, junit_report
 from protocol.conformance.rule import Level, Outcome, Result, Rule
 from protocol.conformance.run import RULES, conforms, run_suite, select
 from protocol.layout import VERSION_MAJOR, VERSION_MINOR
@@ -49,22 +49,27 @@ def conformance(
     """
     side, command = _side(options, needed=not as_list)
     if as_list:
-        _list([side] if side else list(RULES), options)
+        _list([side] if side else list(RULES), options, as_json=as_json)
         return True
     assert command is not None
     _check_command(side, command)
     rules = _rules(side, options)
     if options.junit is not None and not options.junit.parent.is_dir():  # said before minutes are spent
         raise OutputError(f"--junit {options.junit}: there is no folder {options.junit.parent}")
-    results = _run(rules, command, options)
-    if options.junit is not None:
-        _write(options.junit, junit_report(results, side, options.transport))
-    if as_json:
-        click.echo(json.dumps(json_report(results, side, command, options.transport)))
-    else:
-        version = f"{VERSION_MAJOR}.{VERSION_MINOR}"
-        heading = f"{side} {command!r} over {options.transport}, protocol {version}"
-        click.echo(text_report(results, heading, _paint, failed_only=failed_only))
+    results: list[Result] = []
+    version = f"{VERSION_MAJOR}.{VERSION_MINOR}"
+    heading = f"{side} {command!r} over {options.transport}, protocol {version}"
+    text = None if as_json else TextReport(heading, _paint, failed_only=failed_only)
+    whole = len(RULES[side])
+    try:
+        _run(rules, command, options, results, text)
+    finally:  # an interruption loses nothing of what was run
+        if options.junit is not None and results:
+            _write(options.junit, junit_report(results, side, options.transport, whole))
+        if text is not None:
+            _say(text.sums(whole))
+        elif results:
+            click.echo(json.dumps(json_report(results, side, command, options.transport, whole)))
     return conforms(results)
 
 
@@ -119,8 +124,17 @@ def _rules(side: str, options: ConformanceOptions) -> list[Rule]:
     return rules
 
 
-def _run(rules: Sequence[Rule], command: str, options: ConformanceOptions) -> list[Result]:
-    """Run the rules, with a line on stderr that says where they are, if that is a terminal."""
+def _run(
+    rules: Sequence[Rule],
+    command: str,
+    options: ConformanceOptions,
+    results: list[Result],
+    text: TextReport | None,
+) -> None:
+    """Run the rules and gather their results, which the text shows as they come.
+
+    A terminal on stderr has a line that says which rule is run.
+    """
     live, begun = sys.stderr.isatty(), 0
 
     def on_start(rule: Rule) -> None:
@@ -129,20 +143,56 @@ def _run(rules: Sequence[Rule], command: str, options: ConformanceOptions) -> li
         if live:
             click.echo(f"\r\033[K{begun}/{len(rules)} {rule.level.value} {rule.name}", err=True, nl=False)
 
-    try:
-        return run_suite(rules, command, options.transport, options.timeout, on_start)
-    finally:
+    def clear() -> None:
         if live:
             click.echo("\r\033[K", err=True, nl=False)
 
+    def on_end(result: Result) -> None:
+        results.append(result)
+        if text is not None:
+            clear()
+            _say(text.add(result))
 
-def _list(sides: Sequence[str], options: ConformanceOptions) -> None:
+    if text is not None:
+        _say(text.heading)
+    try:
+        run_suite(rules, command, options.transport, options.timeout, on_start, on_end)
+    finally:
+        clear()
+
+
+def _say(lines: Sequence[str]) -> None:
+    for line in lines:
+        click.echo(line)
+
+
+def _list(sides: Sequence[str], options: ConformanceOptions, *, as_json: bool) -> None:
+    """Name the rules of the sides, of the names and levels that were chosen."""
+    unknown = [name for name in options.names if not any(name in RULES[side] for side in sides)]
+    if unknown:
+        raise click.UsageError(f"--rule: there is no rule {unknown[0]!r}; cosim conformance --list names all")
+    listed: list[tuple[str, Rule]] = []
     for side in sides:
-        for rule in _rules(side, options):
-            optional = "" if rule.required else " (not required)"
-            click.echo(
-                f"{side:6}  {rule.level.value:11}  {rule.section:>2}  {rule.name}: {rule.title}{optional}"
-            )
+        names = tuple(name for name in options.names if name in RULES[side])
+        if names or not options.names:
+            listed += [(side, rule) for rule in _rules(side, replace(options, names=names))]
+    if as_json:
+        click.echo(json.dumps({"schema": SCHEMA, "rules": [_described(*each) for each in listed]}))
+        return
+    for side, rule in listed:
+        optional = "" if rule.required else " (not required)"
+        click.echo(f"{side:6}  {rule.level.value:11}  {rule.section:>2}  {rule.name}: {rule.title}{optional}")
+
+
+def _described(side: str, rule: Rule) -> dict[str, str | bool]:
+    return {
+        "side": side,
+        "name": rule.name,
+        "level": rule.level.value,
+        "section": rule.section,
+        "title": rule.title,
+        "required": rule.required,
+    }
 
 
 def _paint(text: str, outcome: Outcome) -> str:

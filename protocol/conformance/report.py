@@ -30,37 +30,68 @@ def plain(text: str, outcome: Outcome) -> str:
 
 
 def text_report(
-    results: Sequence[Result], heading: str, paint: Paint = plain, *, failed_only: bool = False
+    results: Sequence[Result],
+    heading: str,
+    paint: Paint = plain,
+    *,
+    failed_only: bool = False,
+    whole: int = 0,
 ) -> str:
-    """Write one line a rule under its level, with what was found below it, and the sum in the last line.
+    """Write the whole text at once; the arguments are those of `TextReport`, `whole` that of `json_report`."""
+    text = TextReport(heading, paint, failed_only=failed_only)
+    lines = [line for result in results for line in text.add(result)]
+    return "\n".join([*text.heading, *lines, *text.sums(whole)])
+
+
+class TextReport:
+    """The text for people, which grows as rules end: one line a rule under its level, with what was found below it.
 
     What a peer printed more than once, but for numbers in it, is shown where it first was.
 
     Args:
-        results: in the order of levels.
-        heading: the first line: what was judged.
+        heading: the first line: what is judged.
         paint: colours the word of an outcome.
         failed_only: leave out the rules that passed.
     """
-    lines, said, printed = [heading], "", dict[str, str]()
-    for level in Level:
-        of_level = [result for result in results if result.rule.level is level]
-        shown = [r for r in of_level if not failed_only or r.outcome is not Outcome.PASSED]
-        if not shown:
-            continue
-        lines += ["", f"{level.value}: {_sum(of_level)}"]
-        for result in shown:
-            lines.append(_line(result, paint))
-            remark = _remark(result, printed)
-            lines += [
-                f"{_INDENT}{line}"
-                for line in (["as above"] if remark and remark == said else remark.splitlines())
-            ]
-            said = remark
-    verdict, outcome = (
-        ("conforms", Outcome.PASSED) if conforms(results) else ("does not conform", Outcome.FAILED)
-    )
-    return "\n".join([*lines, "", f"{paint(verdict, outcome)}: {_sum(results)}"])
+
+    def __init__(self, heading: str, paint: Paint = plain, *, failed_only: bool = False) -> None:
+        self.heading = [heading]
+        self._paint, self._failed_only = paint, failed_only
+        self._results: list[Result] = []
+        self._levels: list[Level] = []
+        self._said = ""
+        self._printed: dict[str, str] = {}
+
+    def add(self, result: Result) -> list[str]:
+        """Take a result, in the order of levels, and return its lines."""
+        self._results.append(result)
+        if self._failed_only and result.outcome is Outcome.PASSED:
+            return []
+        lines, level = [], result.rule.level
+        if level not in self._levels:
+            self._levels.append(level)
+            lines = ["", level.value]
+        remark = _remark(result, self._printed)
+        told = ["as above"] if remark and remark == self._said else remark.splitlines()
+        self._said = remark
+        return [*lines, _line(result, self._paint), *(f"{_INDENT}{line}" for line in told)]
+
+    def sums(self, whole: int = 0) -> list[str]:
+        """Return the sum of each level that was shown, then the verdict."""
+        by_level = {level: [r for r in self._results if r.rule.level is level] for level in self._levels}
+        lines = ["", *(f"{level.value}: {_sum(results)}" for level, results in by_level.items())]
+        return [
+            *lines,
+            f"{_verdict(self._results, whole, self._paint)}: {_sum(self._results) or 'none ended'}",
+        ]
+
+
+def _verdict(results: Sequence[Result], whole: int, paint: Paint) -> str:
+    """Say whether the peer conforms, or what is known of it where not all rules were run."""
+    part = "" if len(results) >= whole else f"of the rules that were run ({len(results)} of {whole})"
+    if not conforms(results):
+        return ", ".join(filter(None, (paint("does not conform", Outcome.FAILED), part)))
+    return part or paint("conforms", Outcome.PASSED)
 
 
 _INDENT: Final = " " * 13
@@ -90,8 +121,10 @@ def _sum(results: Sequence[Result]) -> str:
     return ", ".join(f"{counts[outcome]} {outcome.value}" for outcome in Outcome if counts[outcome])
 
 
-def json_report(results: Sequence[Result], side: str, command: str, transport: str) -> dict[str, Any]:
-    """Return the report as what `json.dumps` takes."""
+def json_report(
+    results: Sequence[Result], side: str, command: str, transport: str, whole: int = 0
+) -> dict[str, Any]:
+    """Return the report as what `json.dumps` takes; `whole` is how many rules there are, for a run of fewer."""
     counts = Counter(result.outcome for result in results)
     return {
         "schema": SCHEMA,
@@ -100,6 +133,7 @@ def json_report(results: Sequence[Result], side: str, command: str, transport: s
         "command": command,
         "transport": transport,
         "conforms": conforms(results),
+        "complete": len(results) >= whole,
         **{outcome.value: counts[outcome] for outcome in Outcome},
         "rules": [
             {
@@ -118,11 +152,11 @@ def json_report(results: Sequence[Result], side: str, command: str, transport: s
     }
 
 
-def junit_report(results: Sequence[Result], side: str, transport: str) -> str:
+def junit_report(results: Sequence[Result], side: str, transport: str, whole: int = 0) -> str:
     """Write JUnit XML: a suite a level, a case a rule; a rule that is not required never fails there."""
-    root = ElementTree.Element(
-        "testsuites", {"name": f"conformance of the {side} over {transport}", **_totals(results)}
-    )
+    part = "" if len(results) >= whole else f", of the rules that were run ({len(results)} of {whole})"
+    name = f"conformance of the {side} over {transport}{part}"
+    root = ElementTree.Element("testsuites", {"name": name, **_totals(results)})
     for level in Level:
         of_level = [result for result in results if result.rule.level is level]
         if of_level:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import shlex
 import signal
 import subprocess
@@ -28,7 +30,9 @@ def test_a_sound_server_gives_status_0_and_a_report(tmp_path: Path) -> None:
     assert (done.status, done.stderr) == (0, "")
     assert "  passed   §3       header-size: " in done.stdout
     assert "  skipped  annex A  gusts: " in done.stdout
-    assert done.stdout.splitlines()[-1] == "conforms: 1 passed, 1 skipped"
+    assert re.fullmatch(
+        r"of the rules that were run \(2 of \d+\): 1 passed, 1 skipped", done.stdout.splitlines()[-1]
+    )
     assert [case.get("name") for case in ElementTree.parse(junit).iter("testcase")] == [
         "header-size",
         "gusts",
@@ -61,6 +65,8 @@ def test_a_broken_server_gives_status_1_and_names_the_rule(tmp_path: Path) -> No
         (("--server", "true", "--rule", "gusts", "--level", "lanes"), "no rule"),
         (("--server", "true", "--junit", "/no/such/folder/x.xml"), "/no/such/folder"),
         (("--agent", "true", "--rule", "gusts"), "gusts"),
+        (("--server", "true", "--timeout", "nan"), "finite"),
+        (("--list", "--rule", "no-such-rule"), "no-such-rule"),
     ],
 )
 def test_what_cannot_be_meant_is_bad_usage(arguments: tuple[str, ...], said: str) -> None:
@@ -80,6 +86,14 @@ def test_the_list_names_every_rule_of_both_sides() -> None:
     assert run_here("conformance", "--list", "--server", "x", "--level", "lanes").stdout.count("\n") < len(
         lines
     )
+
+
+def test_the_list_is_had_as_json_and_by_name() -> None:
+    """A rule of one side is no error of the other."""
+    done = run_here("conformance", "--list", "--json", "--rule", "gusts")
+    assert done.status == 0
+    (rule,) = json.loads(done.stdout)["rules"]
+    assert (rule["side"], rule["name"], rule["section"]) == ("server", "gusts", "A")
 
 
 def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:

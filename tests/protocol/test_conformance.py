@@ -224,21 +224,24 @@ def test_the_text_has_one_line_a_rule_under_its_level() -> None:
     assert text_report(RESULTS, "server 'x'").splitlines() == [
         "server 'x'",
         "",
-        "core: 1 passed, 1 failed",
+        "core",
         "  passed   §4       first-rule: the first thing holds",
         "  failed   annex A  second-rule: the second thing holds",
         "             height: expected 1, found 2 < 3",
         "             the peer printed:",
         "             | oh\x00 dear",
         "",
-        "lanes: 1 skipped",
+        "lanes",
         "  skipped  §6       third-rule: the third thing holds",
         "             the plant has no walls",
         "",
-        "performance: 1 failed",
+        "performance",
         "  failed   §10      fourth-rule: how fast it is (not required)",
         "             speed: expected more, found less",
         "",
+        "core: 1 passed, 1 failed",
+        "lanes: 1 skipped",
+        "performance: 1 failed",
         "does not conform: 1 passed, 2 failed, 1 skipped",
     ]
 
@@ -252,7 +255,7 @@ def test_the_text_may_leave_out_what_passed() -> None:
     assert [line.split()[0] for line in lines if line.startswith("  ") and "-rule:" in line] == [
         *("failed", "skipped", "failed")
     ]
-    assert lines[2] == "core: 1 passed, 1 failed"
+    assert "core: 1 passed, 1 failed" in lines
     assert lines[-1] == "does not conform: 2 passed, 2 failed, 1 skipped"
 
 
@@ -275,6 +278,47 @@ def test_the_text_shows_the_same_last_words_once() -> None:
         "| no engine",
     ]
     assert lines.count("the peer printed the same as under first-rule") == 2
+
+
+def test_a_run_of_some_rules_says_that_it_is_no_more() -> None:
+    """In text, JSON and JUnit, whether or not one failed."""
+    part = "of the rules that were run (1 of 133)"
+    assert text_report(RESULTS[:1], "x", whole=133).splitlines()[-1] == f"{part}: 1 passed"
+    assert text_report(RESULTS[1:2], "x", whole=133).splitlines()[-1] == f"does not conform, {part}: 1 failed"
+    assert [json_report(RESULTS, "server", "x", "shm", whole)["complete"] for whole in (4, 133)] == [
+        True,
+        False,
+    ]
+    assert part in junit_report(RESULTS[:1], "server", "shm", 133)
+
+
+def test_a_server_that_hangs_at_its_first_request_costs_three_rules(tmp_path: Path) -> None:
+    """Then the rest is not tried, and says so; each result is told as it comes."""
+    text = (
+        f"import sys, time\nsys.path.insert(0, {str(ROOT)!r})\n"
+        "from protocol import physics\nfrom protocol.toy import ToyPlant\n"
+        "class Hangs(ToyPlant):\n    def reset(self, resets, poses):\n        time.sleep(600)\n"
+        "physics.serve(sys.argv[1], Hangs())\n"
+    )
+    heard: list[Result] = []
+    results = run_suite(
+        select("server", [Level.LANES]), program(tmp_path, text), timeout=3.0, on_end=heard.append
+    )
+    assert heard == results
+    assert [result.silent for result in results[:3]] == [True] * 3
+    assert all("not tried, after 3 rules" in result.details for result in results[3:])
+
+
+def test_a_fault_of_the_kit_is_a_failed_rule_that_says_so() -> None:
+    """The other rules are still run."""
+
+    def check(rig: object) -> None:
+        raise ZeroDivisionError("nobody expected this")
+
+    result = run_rule(replace(RULES[0], check=check), "true")
+    assert result.outcome is Outcome.FAILED
+    assert "a fault of the kit" in result.details
+    assert "ZeroDivisionError: nobody expected this" in result.details
 
 
 def test_a_rule_that_is_not_required_does_not_decide() -> None:
