@@ -19,6 +19,7 @@ from typing import Any, Final
 import numpy as np
 from llvmlite import ir
 from numba import __version__, njit, types
+from numba.core.cgutils import raw_memcpy
 from numba.core.event import Event, Listener, install_listener
 from numba.extending import intrinsic
 
@@ -225,16 +226,23 @@ def _release_fence(_typing: Any) -> Any:
     return types.void(), code
 
 
+@intrinsic
+def _copy(_typing: Any, to: Any, source: Any, words: Any) -> Any:
+    """Copy words between addresses as the C library does: a loop over words takes three times as long."""
+
+    def code(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        octet = ir.IntType(8).as_pointer()
+        places = [builder.inttoptr(address, octet) for address in arguments[:2]]
+        raw_memcpy(builder, *places, arguments[2], WORD)
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64, types.int64), code
+
+
 @njit(inline="always")
 def _at(desk: int, word: int) -> int:
     """A word of the desk."""
     return _load(desk + WORD * word)  # type: ignore[no-any-return]
-
-
-@njit(inline="always")
-def _copy(to: int, source: int, words: int) -> None:
-    for offset in range(0, WORD * words, WORD):
-        _store(to + offset, _load(source + offset))
 
 
 @njit(inline="always")
