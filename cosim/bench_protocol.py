@@ -47,10 +47,12 @@ class Effort:
     """Time for one way in one repeat, at most."""
     repeats: int
     idle_s: float
+    observed: int = 200_000
+    """Round trips at one rate of the observer, at most: it should look several times meanwhile."""
 
 
 MEASUREMENT: Final = Effort(20_000, 1.0, 5, 2.0)
-LOOK: Final = Effort(500, 0.1, 3, 0.3)
+LOOK: Final = Effort(500, 0.15, 3, 0.3)
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,7 @@ def measure_protocol(
             figures["lanes"] = _lanes(effort, skipped)
             say("observers ...")
             exchange = "stdlib" if "session_compiled" in skipped else "compiled"
-            figures["observer"] = measure_observer(effort.samples, effort.repeats, effort.seconds, exchange)
+            figures["observer"] = measure_observer(effort.observed, effort.repeats, effort.seconds, exchange)
         figures["bars"] = [
             {"name": bar.name, "found": bar.found, "bar": bar.bar, "reached": bar.reached}
             for bar in judge(figures)
