@@ -8,9 +8,11 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 from protocol.conformance.raw_agent import RawAgent
+from protocol.conformance.removals import removals, removed
 from protocol.conformance.rig import (
     LEAVING_S,
     PeerProcess,
@@ -191,6 +193,23 @@ def _both_stay(agent: RawAgent, where: str) -> None:
     demand(
         len(left) == 2, f"segments of a dead agent {where}, locked by another", "both left to that one", left
     )
+
+
+@server_rule(
+    "pose-removed-first",
+    ROBUSTNESS,
+    "2",
+    "of a dead agent's segments .pose is removed first: one that stands alone tells whose it was",
+)
+def _pose_removed_first(rig: Rig) -> None:
+    with scene(rig, State.READY) as s:
+        command = command_path(s.agent.rendezvous)
+        with removals(command.parent) as watch:
+            s.stand_in.kill()
+            s.go_on()
+            await_end(s.server, "after its agent died")
+            found = [name for name in removed(watch) if Path(name).stem == command.stem]
+        expect("names removed, in order", found, [command.with_suffix(".pose").name, command.name])
 
 
 @server_rule(

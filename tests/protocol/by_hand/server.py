@@ -215,8 +215,8 @@ def leave(command: Segment, pose: Segment, over: bool) -> None:
             if time.monotonic() > until:
                 return
             time.sleep(0.005)
-        pose.unlink(whatever_stands_there=whatever)
-        command.unlink(whatever_stands_there=whatever)
+        for segment in (pose, command) if keeps("pose-removed-first") else (command, pose):
+            segment.unlink(whatever_stands_there=whatever)
 
 
 def main() -> int:
