@@ -191,7 +191,7 @@ def _check_room(tube: Tube, body_radius: float) -> None:
     """
     if tube.found is None:
         return
-    from meshes.centreline_finding import place
+    from meshes.wall import place
 
     tree = build_tree(tube.wall.vertices, tube.wall.faces)
     clearance = np.empty(len(tube.axis))
@@ -227,7 +227,7 @@ def _scale_notes(tube: Tube, options: FlightOptions) -> Iterator[str]:
 
 def _found_notes(tube: Tube, found: FoundCentreline, options: FlightOptions) -> Iterator[str]:
     """The ends that were chosen, in the coordinates of the file, and what else there is to know."""
-    from meshes.centreline_finding import place
+    from meshes.wall import place
 
     ends = []
     for end, number, capped in zip(found.points[[0, -1]], found.used, found.capped, strict=True):

@@ -25,6 +25,14 @@ GAIN: Final = 0.8
 """Share of the way to the centre that a point is moved at a time."""
 ROUNDS: Final = 40
 """Times that points are moved at most: 4 for a round section, and the more the flatter it is."""
+CALM_AFTER: Final = 10
+CALM: Final = 0.92
+"""After so many rounds the gain goes down by this factor in each: sections in a chamber or a junction may turn with
+the path and never come to rest by themselves."""
+ENDS: Final = 5
+"""Points at either end that are not waited for."""
+HELD: Final = 2
+"""Points at either end whose sections stand as the next one does."""
 SETTLED: Final = 0.003
 """Largest move of the last round, over the radius."""
 SMOOTHING: Final = 0.75
@@ -51,37 +59,42 @@ LEAST_WALL: Final = 0.6
 """Fraction of a ring that meets the wall where a mouth begins: half at the middle of an oblique one."""
 
 
-def centre_path(scene: RayScene, path: Floats, radii: Floats) -> Floats:
+def centre_path(scene: RayScene, path: Floats, radii: Floats, is_open: tuple[bool, bool]) -> Floats:
     """A path (P, 3), with the radii (P,) of the tube along it, moved into the centres of the sections, (M, 3).
 
-    Points stand `STEP` radii apart. The ends are cut off where a cap is in the way of whole sections. Sections that
-    side branches open are closed first, see `close_sideways`.
+    Points stand `STEP` radii apart. An end that is not known to be open is cut off where a cap may be in the way of
+    whole sections. Sections that side branches open are closed first, see `close_sideways`.
     """
     points, radii = _respace(path, radii)
     points = _keep_free(scene, points, _smooth(points, FIRST_SMOOTHING))
-    kept = _before_caps(scene, points, radii)
+    kept = _before_caps(scene, points, radii, is_open)
     points, radii = points[kept], radii[kept]
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
+        gain = GAIN * min(CALM ** (number - CALM_AFTER), 1.0)
         points, radii = _respace(points, radii)
-        rings = measure_rings(scene, points, _tangents(points))
+        tangents = _tangents(points)
+        # A free end that turned with its own moves would turn ever further.
+        tangents[:HELD], tangents[-HELD:] = tangents[HELD], tangents[-HELD - 1]
+        rings = measure_rings(scene, points, tangents)
         closed = close_sideways(rings.distances, STEP)
         radii = closed.mean(axis=1)
-        moved = _keep_free(scene, points, points + GAIN * offsets_of_centres(rings, closed))
+        moved = _keep_free(scene, points, points + gain * offsets_of_centres(rings, closed))
         moved = _keep_free(scene, moved, _smooth(moved, SMOOTHING))
-        most = float((np.linalg.norm(moved - points, axis=1) / radii).max())
+        moves = np.linalg.norm(moved - points, axis=1) / radii
         points = moved
-        if most < SETTLED:
+        # The ends have no neighbours that hold them in place: whoever waits for them sees the path shrink.
+        if moves[ENDS:-ENDS].max(initial=0.0) < SETTLED:
             break
     return points
 
 
-def _before_caps(scene: RayScene, points: Floats, radii: Floats) -> slice:
+def _before_caps(scene: RayScene, points: Floats, radii: Floats, is_open: tuple[bool, bool]) -> slice:
     """The part of a path (M, 3) from whose ends no wall is near ahead."""
     tangents, third = _tangents(points), max(len(points) // 3, 1)
     ahead = _wall_ahead(scene, points[-third:], tangents[-third:])[::-1] > BLIND * radii[-third:][::-1]
     behind = _wall_ahead(scene, points[:third], -tangents[:third]) > BLIND * radii[:third]
-    start = int(np.argmax(behind)) if behind.any() else 0
-    stop = int(np.argmax(ahead)) if ahead.any() else 0
+    start = 0 if is_open[0] else int(np.argmax(behind))
+    stop = 0 if is_open[1] else int(np.argmax(ahead))
     return slice(start, len(points) - stop)
 
 
@@ -109,31 +122,40 @@ def _respace(points: Floats, radii: Floats) -> tuple[Floats, Floats]:
     return spaced, np.interp(wanted, along, radii)
 
 
-def to_the_end(scene: RayScene, points: Floats) -> tuple[Floats, bool]:
+def to_the_end(scene: RayScene, points: Floats, is_open: bool) -> tuple[Floats, bool]:
     """Prolong some points (M, 3), `STEP` radii apart, to the mouth of the tube, or up to its cap.
 
     It grows by one step at a time, and its last part is centred anew after each, so that it follows a bend.
 
+    Args:
+        points: centred, the last one near the end.
+        is_open: whether the tube is known to open there: then a wall ahead is that of a bend.
+
     Returns:
         All points, and whether there is a cap.
     """
+    begun, forward = points, _tangents(points[-TAIL:])[-1]
     for _ in range(round(FARTHEST / STEP)):
         tail = points[-TAIL:]
         tangents = _tangents(tail)
+        if tangents[-1] @ forward < 0.0:  # lost: it turned round
+            return begun, False
         rings = measure_rings(scene, tail, tangents)
         typical = close_sideways(rings.distances, STEP)[-1]
         radius = float(typical.mean())
         free = float(_wall_ahead(scene, tail[-1:], tangents[-1:])[0])
-        if free < FREE_BEFORE_CAP * radius:
+        if not is_open and free < FREE_BEFORE_CAP * radius:
             return points, True
         # The mouth may lie before the next point: come closer in twenty steps.
         closer = tail[-1] + np.linspace(0.05, 1.0, 20)[:, None] * STEP * radius * tangents[-1]
-        looks = scene.distances(np.repeat(closer, RING, axis=0), np.tile(rings.directions[-1], (20, 1)), np.inf)
+        looks = scene.distances(
+            np.repeat(closer, RING, axis=0), np.tile(rings.directions[-1], (20, 1)), np.inf
+        )
         inside = (looks.reshape(20, RING) < SIDEWAYS * typical).mean(axis=1) >= LEAST_WALL
         if not inside.all():
             return np.concatenate([points, closer[: int(np.argmin(inside))][-1:]]), False
         points = np.concatenate([points, closer[-1:]])
-        if free > STRAIGHT * radius:
+        if is_open or free > STRAIGHT * radius:
             points = np.concatenate([points[:-TAIL], _settle(scene, points[-TAIL:])])
     return points, False
 
@@ -161,8 +183,9 @@ def _tangents(points: Floats) -> Floats:
     window = _window(points, TANGENT)
     if window <= 3:
         return unit_tangents(points)
-    tangents: Floats = savgol_filter(points, window, 3, deriv=1, axis=0)
-    return tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
+    along = savgol_filter(points, window, 3, deriv=1, axis=0)
+    tangents: Floats = along / np.linalg.norm(along, axis=1, keepdims=True)
+    return tangents
 
 
 def _window(points: Floats, radii: float) -> int:

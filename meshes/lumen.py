@@ -161,7 +161,9 @@ def find_lumens(scene: RayScene, balls: Balls, band: int) -> list[Lumen]:
         if lumen is not None:
             lumens.append(lumen)
     long = COMPARABLE * max((lumen.length for lumen in lumens), default=0.0)
-    return sorted(lumens, key=lambda lumen: (lumen.length < long, not lumen.sealed, -lumen.depth, -lumen.length))
+    return sorted(
+        lumens, key=lambda lumen: (lumen.length < long, not lumen.sealed, -lumen.depth, -lumen.length)
+    )
 
 
 def furthest_ball(lumen: Lumen, ball: int) -> int:

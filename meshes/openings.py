@@ -48,7 +48,7 @@ class Opening:
 
 
 def find_openings(scene: RayScene, lumen: Lumen) -> tuple[list[Opening], list[Opening]]:
-    """The openings of a space, and the holes and slits in its wall; both the most seen first."""
+    """The openings of a space, and the holes and slits in its wall; both the nearest to the origin first."""
     count = len(lumen.balls)
     few = np.unique(np.linspace(0, count - 1, min(count, BALLS)).astype(np.int64))
     # The ends of the space see most of the openings: they are always asked.
@@ -64,8 +64,9 @@ def find_openings(scene: RayScene, lumen: Lumen) -> tuple[list[Opening], list[Op
     near = csr_array((np.ones(len(i)), (i, j)), shape=(len(points), len(points)))
     labels = connected_components(near, directed=False)[1]
     sizes = np.bincount(labels)
-    openings, holes = [], []
-    for label in np.argsort(-sizes, kind="stable"):
+    openings: list[Opening] = []
+    holes: list[Opening] = []
+    for label in range(len(sizes)):
         if sizes[label] < LEAST_LOOKS:
             continue
         at = labels == label
@@ -78,6 +79,8 @@ def find_openings(scene: RayScene, lumen: Lumen) -> tuple[list[Opening], list[Op
         radius = float(np.median(radii[at]))
         fits = NARROW * radius < opening.radius < SLIT * radius
         (openings if fits else holes).append(opening)
+    for found in (openings, holes):
+        found.sort(key=lambda opening: float(np.linalg.norm(opening.centre)))
     return openings, holes
 
 

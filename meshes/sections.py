@@ -41,7 +41,8 @@ class Rings:
         met = np.isfinite(self.distances)
         total: Floats = np.where(met, self.distances, 0.0).sum(axis=1)
         with np.errstate(invalid="ignore"):
-            return total / met.sum(axis=1)
+            mean: Floats = total / met.sum(axis=1)
+        return mean
 
     @property
     def directions(self) -> Floats:

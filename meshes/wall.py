@@ -126,3 +126,13 @@ def to_world(points: Floats, axes: Axes, scale: float, path: Path) -> Floats:
         return points
     x, y, z = points.T
     return np.stack([x, -z, y], axis=1)
+
+
+def place(wall: Wall, point: Floats) -> str:
+    """A point (3,), metres, world frame, in the coordinates of the file, for people."""
+    return "({:.4g}, {:.4g}, {:.4g})".format(*wall.to_file(point[None])[0])
+
+
+def in_units(wall: Wall, metres: float) -> str:
+    """A length (m) in the unit of the file, for people."""
+    return f"{metres / wall.scale:.3g}"
