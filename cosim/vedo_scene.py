@@ -274,7 +274,8 @@ class Stage:
 
     def close(self) -> None:
         """Take it down."""
-        self._plotter.close()
+        if self._begun:  # a window that was never drawn cannot be closed
+            self._plotter.close()
 
     def _add(self, mesh: Any) -> Shape:
         self._plotter.add(mesh)

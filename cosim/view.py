@@ -18,6 +18,7 @@ from cosim.options import SHIPPED_MESH
 from cosim.playback import Playback, View
 from cosim.tracks import Quantity, Track, read_tracks
 from meshes.tube import INDUSTRIAL
+from protocol.signals import held_signals
 
 if TYPE_CHECKING:
     from cosim.film import Image
@@ -103,11 +104,13 @@ def open_stage(
     Raises:
         ViewError: vedo is missing, or there is nothing to draw on.
     """
-    try:
-        from cosim.vedo_scene import Stage
-    except ImportError as error:
-        raise ViewError(f"viewing needs {error.name}; {INSTALL}") from error
-    return Stage(size, offscreen=offscreen, title=title, sky=sky, smooth=smooth)
+    # Ctrl-C waits: in the midst of vedo's imports, which come as they are needed, it would look like a missing one.
+    with held_signals():
+        try:
+            from cosim.vedo_scene import Stage
+        except ImportError as error:
+            raise ViewError(f"viewing needs {error.name or error}; {INSTALL}") from error
+        return Stage(size, offscreen=offscreen, title=title, sky=sky, smooth=smooth)
 
 
 def _view_runs(options: ViewOptions, tracks: tuple[Track, ...]) -> None:
