@@ -50,7 +50,7 @@ def simplify(surface: Surface, triangles: int) -> Surface:
         CosimError: fast-simplification is not installed.
     """
     try:
-        import fast_simplification  # type: ignore[import-untyped]  # quadric error metrics
+        import fast_simplification  # quadric error metrics
     except ImportError as error:
         raise CosimError(
             "large meshes need fast-simplification; install it with: pip install fast-simplification"
