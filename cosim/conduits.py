@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 TUBE_FILES: Final = ("tube.obj", "tube_centerline.obj")
 """Wall and centreline of a generated tube, in the run folder."""
 
+ROOM: Final = 2.0
+"""Least advised distance from the centre of a tube to its wall, over the drone's radius."""
+
 USUAL_RADIUS: Final = (0.5, 2.0)
 """Mean radius (m) of tubes that suit the drone, which is 0.15 m and was trained at 1 m."""
 
@@ -203,8 +206,8 @@ def _check_room(tube: Tube, body_radius: float) -> None:
         raise CentrelineError(
             f"{tube.path}: expected room for the drone, whose radius is {body_radius:g} m, found "
             f"{clearance[i]:.3g} m from the centre to the wall at {place(tube.wall, tube.axis[i])}, "
-            f"{tube.arc_length[i]:.3g} m along of {tube.length:.3g} m; a larger --scale makes the tube wider "
-            "(--scale radius=1)"
+            f"{tube.arc_length[i]:.3g} m along of {tube.length:.3g} m; a larger scale makes it wider: --scale "
+            f"radius={ROOM * body_radius / clearance[i] * tube.radius.mean():.2g} or more"
         )
 
 
