@@ -99,14 +99,15 @@ def _centre(
 
     It stops at a point that is named and lies well before the end of the tube.
     """
-    is_open = [
-        any(np.linalg.norm(opening.centre - way.centres[end]) < NEAR * way.radii[end] for opening in openings)
+    near = [
+        [o for o in openings if np.linalg.norm(o.centre - way.centres[end]) < NEAR * way.radii[end]]
         for end in (0, -1)
     ]
-    points = centre_path(wall.scene, way.centres, way.radii, (is_open[0], is_open[1]))
+    mouths = (-near[0][0].outward if near[0] else None, near[1][0].outward if near[1] else None)
+    points = centre_path(wall.scene, way.centres, way.radii, mouths)
     capped = [False, False]
     for end in (1, 0):  # the end, then, turned round, the start
-        longer, capped[end] = to_the_end(wall.scene, points, is_open[end])
+        longer, capped[end] = to_the_end(wall.scene, points, mouths[end] is not None)
         at = named[end]
         if at is not None and not isinstance(at, int):
             before = float(np.linalg.norm(longer[-1] - np.asarray(at, dtype=np.float64)))

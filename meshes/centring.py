@@ -30,9 +30,11 @@ CALM: Final = 0.92
 """After so many rounds the gain goes down by this factor in each: sections in a chamber or a junction may turn with
 the path and never come to rest by themselves."""
 ENDS: Final = 5
-"""Points at either end that are not waited for."""
+"""Points at either end that are not waited for, and stay where they are from then on."""
 HELD: Final = 2
 """Points at either end whose sections stand as the next one does."""
+MOUTH_POINTS: Final = 5
+"""Points over which the direction of a mouth gives way to that of the path."""
 SETTLED: Final = 0.003
 """Largest move of the last round, over the radius."""
 SMOOTHING: Final = 0.75
@@ -46,6 +48,8 @@ BLIND: Final = 1.0
 TAIL: Final = 16
 """Points at the end of a path that follow its growth."""
 TAIL_ROUNDS: Final = 2
+LOOK_AHEAD: Final = 0.3
+"""A mouth so many radii ahead is gone to straight on."""
 STRAIGHT: Final = 1.2
 """So many radii before a cap a path goes straight on."""
 FARTHEST: Final = 5.0
@@ -59,7 +63,11 @@ LEAST_WALL: Final = 0.6
 """Fraction of a ring that meets the wall where a mouth begins: half at the middle of an oblique one."""
 
 
-def centre_path(scene: RayScene, path: Floats, radii: Floats, is_open: tuple[bool, bool]) -> Floats:
+Mouths = tuple[Floats | None, Floats | None]
+"""Unit vectors (3,) of the tube at its start and end, in the sense of the path; None where it is not known to open."""
+
+
+def centre_path(scene: RayScene, path: Floats, radii: Floats, mouths: Mouths) -> Floats:
     """A path (P, 3), with the radii (P,) of the tube along it, moved into the centres of the sections, (M, 3).
 
     Points stand `STEP` radii apart. An end that is not known to be open is cut off where a cap may be in the way of
@@ -67,34 +75,37 @@ def centre_path(scene: RayScene, path: Floats, radii: Floats, is_open: tuple[boo
     """
     points, radii = _respace(path, radii)
     points = _keep_free(scene, points, _smooth(points, FIRST_SMOOTHING))
-    kept = _before_caps(scene, points, radii, is_open)
+    # The balls of a flat tube are smaller than its sections: once more, by these.
+    radii = close_sideways(measure_rings(scene, points, _tangents(points)).distances, STEP).mean(axis=1)
+    points, radii = _respace(points, radii)
+    points = _keep_free(scene, points, _smooth(points, FIRST_SMOOTHING))
+    kept = _before_caps(scene, points, radii, mouths)
     points, radii = points[kept], radii[kept]
     for number in range(ROUNDS):
         gain = GAIN * min(CALM ** (number - CALM_AFTER), 1.0)
         points, radii = _respace(points, radii)
-        tangents = _tangents(points)
-        # A free end that turned with its own moves would turn ever further.
-        tangents[:HELD], tangents[-HELD:] = tangents[HELD], tangents[-HELD - 1]
-        rings = measure_rings(scene, points, tangents)
+        rings = measure_rings(scene, points, _held_tangents(points, mouths))
         closed = close_sideways(rings.distances, STEP)
         radii = closed.mean(axis=1)
         moved = _keep_free(scene, points, points + gain * offsets_of_centres(rings, closed))
         moved = _keep_free(scene, moved, _smooth(moved, SMOOTHING))
+        if number >= CALM_AFTER:
+            moved[:ENDS], moved[-ENDS:] = points[:ENDS], points[-ENDS:]
         moves = np.linalg.norm(moved - points, axis=1) / radii
         points = moved
-        # The ends have no neighbours that hold them in place: whoever waits for them sees the path shrink.
+        # The ends have no neighbours that hold them in place: while one waited for them the path would shrink.
         if moves[ENDS:-ENDS].max(initial=0.0) < SETTLED:
             break
     return points
 
 
-def _before_caps(scene: RayScene, points: Floats, radii: Floats, is_open: tuple[bool, bool]) -> slice:
+def _before_caps(scene: RayScene, points: Floats, radii: Floats, mouths: Mouths) -> slice:
     """The part of a path (M, 3) from whose ends no wall is near ahead."""
     tangents, third = _tangents(points), max(len(points) // 3, 1)
     ahead = _wall_ahead(scene, points[-third:], tangents[-third:])[::-1] > BLIND * radii[-third:][::-1]
     behind = _wall_ahead(scene, points[:third], -tangents[:third]) > BLIND * radii[:third]
-    start = 0 if is_open[0] else int(np.argmax(behind))
-    stop = 0 if is_open[1] else int(np.argmax(ahead))
+    start = 0 if mouths[0] is not None else int(np.argmax(behind))
+    stop = 0 if mouths[1] is not None else int(np.argmax(ahead))
     return slice(start, len(points) - stop)
 
 
@@ -146,15 +157,15 @@ def to_the_end(scene: RayScene, points: Floats, is_open: bool) -> tuple[Floats, 
         free = float(_wall_ahead(scene, tail[-1:], tangents[-1:])[0])
         if not is_open and free < FREE_BEFORE_CAP * radius:
             return points, True
-        # The mouth may lie before the next point: come closer in twenty steps.
-        closer = tail[-1] + np.linspace(0.05, 1.0, 20)[:, None] * STEP * radius * tangents[-1]
+        # Straight ahead as far as a bend does not matter: there may be the mouth.
+        ahead = np.linspace(0.0, LOOK_AHEAD * radius, 21)[1:, None] * tangents[-1] + tail[-1]
         looks = scene.distances(
-            np.repeat(closer, RING, axis=0), np.tile(rings.directions[-1], (20, 1)), np.inf
+            np.repeat(ahead, RING, axis=0), np.tile(rings.directions[-1], (len(ahead), 1)), np.inf
         )
-        inside = (looks.reshape(20, RING) < SIDEWAYS * typical).mean(axis=1) >= LEAST_WALL
-        if not inside.all():
-            return np.concatenate([points, closer[: int(np.argmin(inside))][-1:]]), False
-        points = np.concatenate([points, closer[-1:]])
+        inside = (looks.reshape(-1, RING) < SIDEWAYS * typical).mean(axis=1) >= LEAST_WALL
+        if not inside.all() and not scene.blocked(tail[-1:], ahead[[int(np.argmin(inside))]])[0]:
+            return np.concatenate([points, ahead[: int(np.argmin(inside))][-1:]]), False
+        points = np.concatenate([points, tail[-1:] + STEP * radius * tangents[-1:]])
         if is_open or free > STRAIGHT * radius:
             points = np.concatenate([points[:-TAIL], _settle(scene, points[-TAIL:])])
     return points, False
@@ -186,6 +197,23 @@ def _tangents(points: Floats) -> Floats:
     along = savgol_filter(points, window, 3, deriv=1, axis=0)
     tangents: Floats = along / np.linalg.norm(along, axis=1, keepdims=True)
     return tangents
+
+
+def _held_tangents(points: Floats, mouths: Mouths) -> Floats:
+    """Unit tangents (M, 3), at the ends those of their mouths.
+
+    A free end that turned with its own moves would turn ever further. Where no mouth is known, it stands as the
+    points before it do.
+    """
+    tangents = _tangents(points)
+    share = np.linspace(1.0, 0.0, min(MOUTH_POINTS, len(points) // 2), endpoint=False)[:, None]
+    for mouth, view in zip(mouths, (tangents, tangents[::-1]), strict=True):
+        if mouth is None:
+            view[:HELD] = view[HELD]
+        else:
+            view[: len(share)] = share * mouth + (1.0 - share) * view[: len(share)]
+    unit: Floats = tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
+    return unit
 
 
 def _window(points: Floats, radii: float) -> int:

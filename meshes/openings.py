@@ -77,11 +77,21 @@ def find_openings(scene: RayScene, lumen: Lumen) -> tuple[list[Opening], list[Op
         across -= (across @ outward)[:, None] * outward
         opening = Opening(centre, outward, float(np.sqrt(2.0 * (across**2).sum(axis=1).mean())))
         radius = float(np.median(radii[at]))
+        if _within(scene, lumen, opening, radius):
+            continue
         fits = NARROW * radius < opening.radius < SLIT * radius
         (openings if fits else holes).append(opening)
     for found in (openings, holes):
         found.sort(key=lambda opening: float(np.linalg.norm(opening.centre)))
     return openings, holes
+
+
+def _within(scene: RayScene, lumen: Lumen, opening: Opening, radius: float) -> bool:
+    """Whether the same space goes on in front of an opening: a hall is so wide that its middle looks open."""
+    ways = lumen.balls.centres - opening.centre
+    before = (ways @ opening.outward > radius) & (np.linalg.norm(ways, axis=1) < REACH * radius)
+    targets = lumen.balls.centres[before]
+    return bool((~scene.blocked(np.tile(opening.centre, (len(targets), 1)), targets)).any())
 
 
 def _leave(scene: RayScene, balls: Balls) -> tuple[Floats, Floats, Floats]:
