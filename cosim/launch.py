@@ -31,7 +31,7 @@ from cosim.inputs import (
     parse_parameters,
     setting_notes,
 )
-from cosim.live import LiveLine
+from cosim.live import LiveLine, working
 from cosim.live_view import LiveView, ViewChoice
 from cosim.options import SHIPPED_MESH, SHIPPED_POLICY, FlightOptions
 from cosim.pilots import SHIPPED_CHECKPOINT, Pilot, PilotChoice, Terms, choose_pilot, read_pilot
@@ -90,7 +90,7 @@ def launch(
     after: Continuation | None = None,
     view: ViewChoice | None = None,
 ) -> dict[str, Any]:
-    """Fly once, say what happened, and return the report that --json prints.
+    """Fly once, say what happened, and return the report; --json prints it with what is said of the mesh.
 
     The physics process starts up while the tube is read; bad input ends it and leaves nothing behind. With
     `as_json` stdout holds one JSON object and everything else goes to stderr. With `after` the
@@ -129,10 +129,11 @@ def launch(
             say(f"waiting for a physics peer at {rendezvous} (at most {options.attach_timeout:g} s)")
         else:
             process = stack.enter_context(PhysicsProcess(command, rendezvous, folder))
-        if mesh is None:
-            conduit = generate_conduit(options, recipe, folder)
-        else:
-            conduit = read_conduit(options, mesh, folder, float(conditions.drawn["body_radius"][0]))
+        with working("reading the tube" if mesh is not None else "making the tube"):
+            if mesh is None:
+                conduit = generate_conduit(options, recipe, folder)
+            else:
+                conduit = read_conduit(options, mesh, folder, float(conditions.drawn["body_radius"][0]))
         stack.callback(_forget_unflown, folder, conduit.written)
         for note in (*conduit.notes, *pilot.notes, *conditions.notes):
             say(note)
@@ -153,7 +154,7 @@ def launch(
             Flight(options, conduit, pilot, conditions, session, rendezvous, folder), after
         )
     if as_json:
-        click.echo(json.dumps(report))
+        click.echo(json.dumps(report | {"mesh": conduit.description["mesh"]}))
     else:
         _summarise(report, pilot, conduit, say)
     return report

@@ -1,4 +1,4 @@
-"""The live line of a flight, and a bar for many of them, on a terminal; silent where stderr is none."""
+"""On a terminal, and silent where stderr is none: the live line of a flight, a bar, a sign of work."""
 
 from __future__ import annotations
 
@@ -81,3 +81,15 @@ def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
     ) as bar:
         task = bar.add_task("", total=total)
         yield lambda done: bar.advance(task, done)
+
+
+@contextmanager
+def working(what: str) -> Iterator[None]:
+    """A sign on a terminal that something of unknown length is being done; silent where stderr is none."""
+    if sys.stderr is None or not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(what):
+        yield

@@ -151,6 +151,7 @@ def test_a_found_centreline_makes_a_whole_run(fly: Callable[..., Done], tmp_path
     for words in ("scale: 0.04", "centreline: found", "opening 1 at", "opening 2 at"):
         assert words in done.stderr
     described = manifest_of(tmp_path / "run")["mesh"]
+    assert done.report["mesh"] == described
     stored = tmp_path / "run" / "organ_centerline.obj"
     assert described["centreline"] == str(stored)
     assert described["centreline_sha256"] == hashlib.sha256(stored.read_bytes()).hexdigest()
