@@ -64,7 +64,7 @@ LEAST_WALL: Final = 0.6
 
 
 Mouths = tuple[Floats | None, Floats | None]
-"""Unit vectors (3,) of the tube at its start and end, in the sense of the path; None where it is not known to open."""
+"""Unit vectors (3,) of the tube at its start and end, in the sense of the path; None where none is known to open."""
 
 
 def centre_path(scene: RayScene, path: Floats, radii: Floats, mouths: Mouths) -> Floats:
@@ -102,14 +102,14 @@ def centre_path(scene: RayScene, path: Floats, radii: Floats, mouths: Mouths) ->
 def _before_caps(scene: RayScene, points: Floats, radii: Floats, mouths: Mouths) -> slice:
     """The part of a path (M, 3) from whose ends no wall is near ahead."""
     tangents, third = _tangents(points), max(len(points) // 3, 1)
-    ahead = _wall_ahead(scene, points[-third:], tangents[-third:])[::-1] > BLIND * radii[-third:][::-1]
-    behind = _wall_ahead(scene, points[:third], -tangents[:third]) > BLIND * radii[:third]
+    ahead = wall_ahead(scene, points[-third:], tangents[-third:])[::-1] > BLIND * radii[-third:][::-1]
+    behind = wall_ahead(scene, points[:third], -tangents[:third]) > BLIND * radii[:third]
     start = 0 if mouths[0] is not None else int(np.argmax(behind))
     stop = 0 if mouths[1] is not None else int(np.argmax(ahead))
     return slice(start, len(points) - stop)
 
 
-def _wall_ahead(scene: RayScene, points: Floats, tangents: Floats) -> Floats:
+def wall_ahead(scene: RayScene, points: Floats, tangents: Floats) -> Floats:
     """How far along the tangents (M, 3) from points (M, 3) a wall stands across the whole way (m), (M,).
 
     The furthest along any of a narrow cone of rays: in a bend one of them looks around the corner.
@@ -154,7 +154,7 @@ def to_the_end(scene: RayScene, points: Floats, is_open: bool) -> tuple[Floats, 
         rings = measure_rings(scene, tail, tangents)
         typical = close_sideways(rings.distances, STEP)[-1]
         radius = float(typical.mean())
-        free = float(_wall_ahead(scene, tail[-1:], tangents[-1:])[0])
+        free = float(wall_ahead(scene, tail[-1:], tangents[-1:])[0])
         if not is_open and free < FREE_BEFORE_CAP * radius:
             return points, True
         # Straight ahead as far as a bend does not matter: there may be the mouth.

@@ -52,6 +52,13 @@ class RayScene:
         distances: Floats = hits.astype(np.float64)
         return np.minimum(distances, reach, out=distances)
 
+    def faces_hit(self, origins: Floats, directions: Floats) -> NDArray[np.int64]:
+        """Index of the face that each ray (M, 3), (M, 3) meets first, (M,), -1 where there is none."""
+        hits = self._scene.run(
+            (origins - self.centre).astype(np.float32), directions.astype(np.float32), query="INTERSECT"
+        )
+        return hits.astype(np.int64)  # type: ignore[no-any-return]
+
     def blocked(self, origins: Floats, targets: Floats) -> Bools:
         """Whether a wall lies between each origin (M, 3) and its target (M, 3), metres, (M,)."""
         # Directions as long as the way, and cast to 1: no square root, and a way of length 0 is free.

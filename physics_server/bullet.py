@@ -24,6 +24,26 @@ from protocol.plant import (
     TubeReference,
 )
 
+RAYS_MAX: Final = 16_000
+"""Rays that pybullet takes in one batch, and a little less."""
+
+
+def measure_wall(tube: TubeReference, origins: Floats, directions: Floats, reach: float) -> Floats:
+    """Distance (m) to a tube's wall as the engine sees it, along rays (M, 3), (M, 3), at most `reach` (m), (M,).
+
+    Raises:
+        Refusal: the file cannot be read as a mesh, or is another than the reference says.
+    """
+    world = World(1.0 / 240.0)
+    try:
+        world.build(read_registered(tube, VERTICES_MAX, INDICES_MAX))
+        batches = range(0, len(origins), RAYS_MAX)
+        return np.concatenate(
+            [world.distances(origins[i : i + RAYS_MAX], directions[i : i + RAYS_MAX], reach) for i in batches]
+        )
+    finally:
+        world.close()
+
 
 class _Lane:
     """One lane's world and where it stands."""
