@@ -28,7 +28,7 @@ def refused(done: Done, folder: Path, *words: str) -> None:
     """Status 2, one line that contains the words, nothing on stdout, no run folder."""
     assert done.status == 2, done.stderr
     assert done.stdout == ""
-    sentences = [line for line in done.stderr.splitlines() if not line.startswith(("mesh:", "policy:", "session:"))]
+    sentences = [line for line in done.stderr.splitlines() if not line.startswith(("mesh:", "policy:"))]
     assert len(sentences) == 1 or sentences[0].startswith("Usage"), done.stderr
     for word in words:
         assert word in done.stderr
