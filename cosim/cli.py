@@ -52,6 +52,7 @@ for _command in (
     commands_flights.launch,
     commands_flights.evaluate,
     commands_flights.replay,
+    commands_runs.inspect,
     commands_runs.view,
     commands_runs.report,
     commands_runs.export,

@@ -11,11 +11,31 @@ from typing import Any, Final
 
 import click
 
-from cosim.options import view_options
+from cosim.options import inspect_options, view_options
 from cosim.screens import EXIT_NO_SUCCESS, command, json_option, option
 
 FORMATS: Final = ("csv", "npz", "parquet", "tum", "mcap", "gltf", "usd")
 """Of `cosim.export`, whose imports a command's help does not wait for."""
+
+
+@command(short_help="Say whether a mesh can be flown through, and what its tube is like.")
+@click.argument("mesh", type=click.Path(path_type=Path))
+@inspect_options
+@json_option
+def inspect(mesh: Path, as_json: bool, **options: Any) -> None:
+    """Find the centreline of a MESH and say, by arc length, what its tube is like; or why it cannot be flown.
+
+    Reads .obj, .stl, .ply, .off, .glb, .gltf and .dae. --out writes profile.png, overview.png, inspection.json and
+    the centreline for --centerline. Exits 2 with the reason and the place where there is no tube to fly.
+
+    \b
+    cosim inspect tube.stl --out inspection
+    cosim inspect cave.obj --entry 1 --exit 3 --scale radius=1
+    """
+    from cosim.inspect import InspectOptions
+    from cosim.inspect import inspect as run
+
+    run(InspectOptions(mesh, **options), as_json=as_json)
 
 
 @command(short_help="Show runs or a mesh in 3-D; write pictures and films.")

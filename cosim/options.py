@@ -279,6 +279,22 @@ _VIEW: Final = (
 )  # fmt: skip
 
 
+_INSPECT: Final = (
+    option("--centerline", type=click.Path(path_type=Path), metavar="PATH",
+                 help="[default: <mesh stem>_centerline.obj beside the mesh, else it is found]"),
+    option("--entry", type=PlaceType(), metavar="N|x,y,z",
+                 help="Where it is to start: an opening's number, or a point in the file's coordinates."),
+    option("--exit", type=PlaceType(), metavar="N|x,y,z", help="Where it is to end."),
+    option("--axes", type=click.Choice(["auto", "zup", "yup"]), default="auto", show_default=True,
+                 help="Up axis of the file; auto follows the file or its format."),
+    SCALE,
+    option("--body-radius", type=float, callback=_positive, default=0.15, show_default=True, metavar="R",
+                 help="Of the drone (m)."),
+    option("--out", type=click.Path(path_type=Path), metavar="DIR",
+                 help="Write pictures, numbers, and the centreline that was found."),
+)  # fmt: skip
+
+
 _EVALUATE: Final = (
     option("--policy", "policies", multiple=True, metavar="P",
                  help="Checkpoint, pure-pursuit (look-ahead the camera's 3 m; in `cosim launch` 1 m), "
@@ -323,6 +339,11 @@ def evaluate_options(command: Command) -> Command:
 def view_options(command: Command) -> Command:
     """Give a click command the options of `cosim.view.ViewOptions`."""
     return _with(_VIEW, command)
+
+
+def inspect_options(command: Command) -> Command:
+    """Give a click command the options of `cosim.inspect.InspectOptions`."""
+    return _with(_INSPECT, command)
 
 
 def _with(options: tuple[Callable[[Command], Command], ...], command: Command) -> Command:

@@ -2,11 +2,17 @@
 
 MeshError
 ├── MeshReadError      the file is missing, unreadable, empty, or of a form that is not read
-├── CentrelineError    the centreline branches, is a loop, has gaps, or lies outside the tube
+├── CentrelineError    the centreline branches, is a loop, has gaps, lies outside the tube, or cannot be found
+│   └── EndsError      the tube has several openings, and it is not said which are meant
 └── CurveError         a generated curve is too tight or comes too near to itself
 """
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from meshes.openings import Opening
 
 
 class MeshError(Exception):
@@ -19,6 +25,14 @@ class MeshReadError(MeshError):
 
 class CentrelineError(MeshError):
     """A centreline that cannot be flown along."""
+
+
+class EndsError(CentrelineError):
+    """Several openings without a choice; carries them."""
+
+    def __init__(self, text: str, openings: tuple[Opening, ...]) -> None:
+        super().__init__(text)
+        self.openings = openings
 
 
 class CurveError(MeshError):

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import dijkstra  # type: ignore[import-untyped]
 from scipy.spatial import cKDTree  # type: ignore[import-untyped]
 
 from meshes.curves import arc_lengths
-from meshes.errors import CentrelineError
+from meshes.errors import CentrelineError, EndsError
 from meshes.geometry import Bools, Floats
 from meshes.lumen import BANDS, ENCLOSED, Balls, Lumen, find_lumens, furthest_ball, shortest_way
 from meshes.openings import Opening, find_openings
@@ -121,9 +121,10 @@ def choose_ends(
     start, end = named
     if start is None or end is None:
         if len(openings) > 2:
-            raise CentrelineError(
+            raise EndsError(
                 f"{wall.path}: expected two openings, or an entry and an exit, found {len(openings)} openings: "
-                f"{list_openings(wall, openings)}; name two (--entry 1 --exit 2, or coordinates)"
+                f"{list_openings(wall, openings)}; name two (--entry 1 --exit 2, or coordinates)",
+                tuple(openings),
             )
         ends = [_inside_of(wall, lumen, opening) for opening in openings]
         if start is None and end is None:
