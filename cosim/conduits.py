@@ -14,13 +14,13 @@ from agent_client.tubes import TubeRecipe, draw_tube
 from cosim.errors import OutputError
 from cosim.options import SHIPPED_MESH, FlightOptions
 from cosim.pilots import existing_file
-from meshes.closest import build_tree, wall_distance
 from meshes.errors import CentrelineError
 from meshes.formats import AxesChoice
 from meshes.geometry import Geometry
 from meshes.mesh_geometry import MeshGeometry
 from meshes.scale import MeanRadius
 from meshes.tube import INDUSTRIAL, Tube, read_tube
+from meshes.wall import place
 from protocol.plant import TubeReference
 
 if TYPE_CHECKING:
@@ -194,13 +194,11 @@ def _check_room(tube: Tube, body_radius: float) -> None:
     """
     if tube.found is None:
         return
-    from meshes.wall import place
+    from meshes.inspection import clearance_of  # scipy comes with it, which a given centreline does not need
 
-    tree = build_tree(tube.wall.vertices, tube.wall.faces)
-    clearance = np.empty(len(tube.axis))
-    wall_distance(
-        np.ascontiguousarray(tube.axis), tree.boxes, tree.triangles, np.full(len(clearance), -1), clearance
-    )
+    # The drone comes no closer to the ends than half a radius, where there may be caps.
+    to_end = np.minimum(tube.arc_length, tube.length - tube.arc_length)
+    clearance = np.where(to_end < 0.5 * tube.radius, np.inf, clearance_of(tube.wall, tube.axis))
     i = int(np.argmin(clearance))
     if clearance[i] <= body_radius:
         raise CentrelineError(
@@ -220,18 +218,17 @@ def _scale_notes(tube: Tube, options: FlightOptions) -> Iterator[str]:
     elif options.scale is None and stated.unit is not None:
         yield f"scale: {tube.scale:g} m a unit, as {stated.where}"
     if not USUAL_RADIUS[0] <= mean <= USUAL_RADIUS[1]:
-        assumed = (
-            " with a metre a unit, since none is stated" if options.scale is None and not stated.unit else ""
-        )
-        yield f"scale: a mean radius of {mean:.3g} m{assumed}; tubes of 1 m suit the drone (--scale radius=1)"
+        yield f"scale: a mean radius of {mean:.3g} m, where tubes of 1 m suit the drone (--scale radius=1)"
+        if options.scale is None and stated.unit is None:
+            from meshes.inspection import guess_unit
+
+            yield f"scale: taken as metres: {guess_unit(mean / tube.scale, stated).reason}"
     if options.axes == "auto" and stated.axes is not None:
         yield f"axes: {'Y' if tube.axes == 'yup' else 'Z'} up, as {stated.where}"
 
 
 def _found_notes(tube: Tube, found: FoundCentreline, options: FlightOptions) -> Iterator[str]:
     """The ends that were chosen, in the coordinates of the file, and what else there is to know."""
-    from meshes.wall import place
-
     ends = []
     for end, number, capped in zip(found.points[[0, -1]], found.used, found.capped, strict=True):
         what = f"opening {number}" if number is not None else "a cap" if capped else "a place inside"

@@ -88,7 +88,8 @@ class LiveScene:
         if self._frames is None:
             self._stage.draw()
         elif snapshot is not None:
-            write_picture(self._frames / f"frame-{snapshot.step:06d}.png", self._stage.picture())
+            picture = self._stage.picture()
+            write_picture(self._frames / f"frame-{snapshot.step:06d}.png", picture, quickly=True)
 
     def wait(self, until: float) -> None:
         """Answer to mouse and keys until a time of the monotonic clock (s)."""

@@ -24,17 +24,18 @@ from typing import IO, Any, Final, Self
 import protocol
 from agent_client.settings import Settings
 from cosim.senses import Sensors
-from cosim.watch import step_back
 from protocol.liveness import describe_exit
 
 FRAMES_PER_S: Final = 10.0
 READY: Final = b"ready\n"
-READY_S: Final = 15.0
+READY_S: Final = 30.0
 """How long a flight waits for its window (s); after that it goes on without."""
 LINGER_S: Final = 2.0
 """How long the window stays when the session has ended (s)."""
 STOP_S: Final = 2.0
 """How long the viewer may take to end (s) before it is killed."""
+NICE: Final = 10
+"""A tenth of the weight of the session's processes: pictures are drawn even where these take all cores."""
 
 _VIEWER: Final = (
     f"import sys; sys.path.append({str(Path(protocol.__file__).resolve().parents[1])!r}); "
@@ -79,6 +80,8 @@ class LiveView:
         self._choice, self._say = choice, say
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: IO[bytes] | None = None
+        self._told = False
+        """Whether the user knows that there is no view any more."""
 
     def start(
         self,
@@ -142,31 +145,44 @@ class LiveView:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._process is not None:
-            if error is None:
-                with suppress(subprocess.TimeoutExpired):  # it lingers, and leaves by itself
-                    self._process.wait(LINGER_S + STOP_S)
-            if self._process.poll() is None:
-                self._process.terminate()
-                with suppress(subprocess.TimeoutExpired):
-                    self._process.wait(STOP_S)
-            self._process.kill()
-            if self._process.wait() > 0 or (error is None and self._process.returncode < 0):
+        try:
+            if (
+                self._process is not None
+                and not self._told
+                and self._ends_by_itself(0.0 if error else LINGER_S + STOP_S)
+            ):
                 self._give_up("the flight went on without it")
-        if self._errors is not None:
-            self._errors.close()
+        finally:
+            if self._process is not None:
+                self._process.kill()
+                self._process.wait()
+                assert self._process.stdout is not None
+                self._process.stdout.close()
+            if self._errors is not None:
+                self._errors.close()
+
+    def _ends_by_itself(self, patience: float) -> bool:
+        """Wait for it to leave, and tell whether it failed before it was told to."""
+        assert self._process is not None
+        try:
+            return self._process.wait(patience) != 0
+        except subprocess.TimeoutExpired:
+            self._process.terminate()
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(STOP_S)
+            return False
 
     def _give_up(self, then: str) -> None:
         """Say why there is no view any more, once."""
         process, errors = self._process, self._errors
         assert process is not None
         assert errors is not None
-        self._process = None
         try:
             code = process.wait(STOP_S)
         except subprocess.TimeoutExpired:
             process.kill()
             code = process.wait()
+        self._told = True
         errors.seek(0)
         words = errors.read().decode(errors="replace").strip().splitlines()
         why = words[-1] if words else describe_exit(code)
@@ -175,10 +191,9 @@ class LiveView:
 
 def main(told: str) -> int:
     """The viewer's process; returns its exit status."""
-    step_back()
     # One thread draws: where there is no graphics card, others would take the cores of the session.
     os.environ.setdefault("LP_NUM_THREADS", "1")
-    # Here, after the step back: they take a second of a core.
+    # Here: they take a second of a core, which the launcher must not spend.
     from cosim.errors import CosimError
     from cosim.live_scene import LiveScene
     from meshes.errors import MeshError
@@ -192,6 +207,7 @@ def main(told: str) -> int:
             scene = LiveScene(what)
             try:
                 scene.draw(observer)
+                _step_back()  # not before: the flight waits
                 with suppress(BrokenPipeError):  # the launcher does not wait any more
                     os.write(1, READY)
                 _look_on(scene, observer)
@@ -201,6 +217,15 @@ def main(told: str) -> int:
         sys.stderr.write(f"{error}\n")
         return 1
     return 0
+
+
+def _step_back() -> None:
+    """Leave the cores to the session."""
+    if hasattr(os, "nice"):
+        os.nice(NICE)
+    # Where the system shares its cores among sessions of processes first, the priority within ours says nothing.
+    with suppress(OSError):
+        Path("/proc/self/autogroup").write_text(str(NICE))
 
 
 def _look_on(scene: Any, observer: Any) -> None:

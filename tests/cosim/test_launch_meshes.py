@@ -259,7 +259,7 @@ def test_a_tube_that_cannot_be_flown_is_refused_with_the_place(
     mesh = write(extrude(axis, [circle(24, r) for r in waist]), tmp_path / "waist.stl")
     done = fly("--mesh", str(mesh), "--scale", "0.3")
     assert done.status == 2, done.stderr
-    for words in ("room for the drone", "0.15 m", "(8", "--scale"):
+    for words in ("room for the drone", "0.15 m", "2.4 m along", "--scale radius=0."):
         assert words in done.stderr
     assert not (tmp_path / "run").exists()
 
@@ -270,6 +270,15 @@ def test_a_tube_that_cannot_be_flown_is_refused_with_the_place(
     assert done.status == 2, done.stderr
     assert kept.name in done.stderr
     assert kept.read_text() == "# mine\n"
+
+
+def test_a_unit_that_nobody_states_is_guessed(fly: Callable[..., Done], tmp_path: Path) -> None:
+    """A tube 40 wide in a file without a unit is flown in metres, and said to look like millimetres."""
+    mesh = write((20.0 * wavy()[0], wavy()[1]), tmp_path / "tube.stl")
+    done = fly("--mesh", str(mesh), "--max-steps", "1")
+    assert done.status == 0, done.stderr
+    for words in ("mean radius of 19.9 m", "radius=1", "millimetres"):
+        assert words in done.stderr
 
 
 def test_a_blocked_tube_is_refused(fly: Callable[..., Done], tmp_path: Path) -> None:

