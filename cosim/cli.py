@@ -11,7 +11,14 @@ from typing import Any, Final
 
 import click
 
-from cosim import __version__, commands_flights, commands_protocol, commands_runs, commands_training
+from cosim import (
+    __version__,
+    commands_flights,
+    commands_protocol,
+    commands_runs,
+    commands_training,
+    interrupts,
+)
 from cosim.errors import INTERNAL, Terminated, exit_status
 
 CONTEXT: Final = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
@@ -73,7 +80,9 @@ def _interrupted(number: int, _frame: FrameType | None) -> None:
     """Ctrl-C or SIGTERM: the first one ends the command in order, and another must not cut the cleaning up short."""
     for deaf_to in (signal.SIGINT, signal.SIGTERM):
         signal.signal(deaf_to, signal.SIG_IGN)
-    raise KeyboardInterrupt if number == signal.SIGINT else Terminated
+    error = KeyboardInterrupt if number == signal.SIGINT else Terminated
+    interrupts.remember(error)
+    raise error
 
 
 def main() -> None:

@@ -136,7 +136,7 @@ def bench(
 
     \b
     cosim bench --quick
-    cosim bench --protocol --png round_trips.png     against UDP, Pipe, ZeroMQ, gRPC, iceoryx2, PyBullet, C
+    cosim bench --protocol --png round_trips.png   # against UDP, ZeroMQ, gRPC, ...
     """
     if training and protocol:
         raise click.UsageError("--training and --protocol: expected one of them, found both")

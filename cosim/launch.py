@@ -20,7 +20,7 @@ from agent_client.flight import FlightResult, FlightStep, FlownBefore, fly
 from agent_client.settings import max_steps
 from agent_client.start import build_resets
 from agent_client.task import Outcome
-from cosim import __version__
+from cosim import __version__, interrupts
 from cosim.conduits import Conduit, find_mesh, generate_conduit, read_conduit
 from cosim.errors import RunError, Terminated
 from cosim.folders import check_folder, new_folder
@@ -142,6 +142,7 @@ def launch(
         )
         if process is not None:
             say(f"session: {rendezvous} (cosim watch shows its live state)")
+        interrupts.check()
         plant = session.description
         say(f"physics: {plant.name} {plant.version}, engine {plant.engine}")
         if not plant.walls:
@@ -251,6 +252,7 @@ class _Observer:
         """From the start of this process to the first control step."""
 
     def __call__(self, step: FlightStep) -> None:
+        interrupts.check()
         self._recorder.write(step)
         if self._after is not None:
             self._after.check(step.index, self._recorder.trajectory_hash)

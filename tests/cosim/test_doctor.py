@@ -19,7 +19,7 @@ from cosim import doctor
 from cosim.doctor import Check, Level
 from cosim.requirements import Requirement, read_requirements
 from protocol import leftovers
-from protocol.leftovers import Standing, survey
+from protocol.leftovers import survey
 from protocol.memory import Rendezvous
 
 PATIENCE_S = 20.0
@@ -42,7 +42,7 @@ def leave_dead_session(temporary: Path) -> Callable[[], Rendezvous]:
     def make() -> Rendezvous:
         place = Rendezvous("file", str(temporary / "dead"))
         with stamped.part("fly", place, 1):
-            until(lambda: any(found.standing is Standing.LIVE for found in survey([temporary])))
+            until(lambda: stamped.offered(place))
         return place
 
     return make

@@ -296,7 +296,7 @@ def test_a_setting_that_changes_nothing_is_named(
 
 def test_every_setting_is_an_option_that_help_names(tmp_path: Path) -> None:
     """The generated options stand in a few lines of the help, and --list-settings says what each means."""
-    text = run_cosim("evaluate", "--help", cwd=tmp_path).stdout
+    text = run_cosim("evaluate", "--help-all", cwd=tmp_path).stdout
     meanings = run_cosim("evaluate", "--list-settings", cwd=tmp_path).stdout
     for row in (*CONDITIONS, *TUBE_SETTINGS):
         option = f"--{row.name.replace('_', '-')}"

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from protocol.agent import AgentSession, SessionSettings
+from protocol.layout import COMMAND_MAGIC
 from protocol.physics import serve
 from protocol.plant import CommandBatch, PlantDescription, PoseBatch, ResetBatch
 from protocol.toy import DEFAULTS, SPEED_MAX, ToyPlant
@@ -62,6 +63,13 @@ def fly(rendezvous: str, lanes: int, steps: int) -> None:
             stamp(commands, step)
             poses = session.step(commands)
             assert np.all(poses.step == step)
+
+
+def offered(rendezvous: object) -> bool:
+    """Whether the agent's header stands whole; a kill before leaves a header that is unfinished and not dead."""
+    kind, _, stem = str(rendezvous).partition(":")
+    path = Path(f"/dev/shm/{stem}.cmd" if kind == "shm" else f"{stem}.cmd")
+    return path.exists() and path.read_bytes()[:8] == COMMAND_MAGIC
 
 
 @contextmanager

@@ -119,7 +119,8 @@ def test_an_agent_that_dies_before_anybody_attached_leaves_leftovers(
 ) -> None:
     """An offer without a physics side is live with its agent and dead without."""
     with stamped.part("fly", rendezvous, LANES):
-        eventually(lambda: standing(rendezvous) is Standing.LIVE)
+        eventually(lambda: stamped.offered(rendezvous))
+        assert standing(rendezvous) is Standing.LIVE
     assert standing(rendezvous) is Standing.DEAD
     remove(parse_rendezvous(rendezvous))
 
