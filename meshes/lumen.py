@@ -1,6 +1,6 @@
 """The free space inside of a wall, as balls that hold no wall and the ways between them.
 
-Points of the wall are drawn evenly by area, a ray goes from each to both sides, and the middle of every chord that
+Points of the wall are drawn, a ray goes from each to both sides, and the middle of every chord that
 ends at a wall again is the centre of a ball: its radius is the distance to the nearest wall. Balls whose
 surroundings are mostly wall are enclosed: they lie in a tube, not beside it. Two balls are joined where they touch
 and the way between them is free and enclosed. No grid is laid, so that neither the unit nor the length of a tube
@@ -29,7 +29,7 @@ LOOKS: Final = 42
 """Directions in which a ball looks around."""
 FEW_LOOKS: Final = 26
 """The same where many places look around."""
-REACH: Final = 8.0
+REACH: Final = 6.5
 """A wall further away than so many radii does not enclose a ball."""
 ENCLOSED: Final = 0.7
 """Fraction of the looks that an enclosed ball has walls in. In a trough half of them leave; at the mouth of a tube
@@ -183,12 +183,14 @@ def _middles_of_chords(scene: RayScene, vertices: Floats, faces: NDArray[np.int3
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)
     doubled = np.linalg.norm(across, axis=1)
-    total = doubled.sum()
-    if not total > 0.0:
+    solid = doubled > 0.0
+    if not solid.any():
         return np.empty((0, 3))
+    # Half by area and half by number: a pipe in a hall has little area, and small triangles.
+    shares = 0.5 * doubled / doubled.sum() + 0.5 * solid / solid.sum()
     rng = np.random.default_rng(0)  # the same centreline whenever it is asked for
-    drawn = np.searchsorted(np.cumsum(doubled) / total, (np.arange(CHORDS) + rng.random(CHORDS)) / CHORDS)
-    drawn = np.minimum(drawn, len(faces) - 1)
+    drawn = np.searchsorted(np.cumsum(shares), (np.arange(CHORDS) + rng.random(CHORDS)) / CHORDS)
+    drawn = np.minimum(drawn, np.flatnonzero(solid)[-1])
     u, v = rng.random((2, CHORDS, 1))
     u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)
     points = a[drawn] + u * (b - a)[drawn] + v * (c - a)[drawn]
@@ -215,7 +217,7 @@ def _apart_from(scene: RayScene, small: Balls, large: Balls) -> Ints:
         return np.empty(0, dtype=np.int64)
     distance, nearest = cKDTree(large.centres).query(small.centres, k=min(4, len(large)))
     distance, nearest = distance.reshape(len(small), -1), nearest.reshape(len(small), -1)
-    beside = distance < TOUCH * (small.radii[:, None] + large.radii[nearest])
+    beside = distance < small.radii[:, None] + large.radii[nearest]
     ball, k = np.nonzero(beside)
     beside[ball, k] = ~scene.blocked(small.centres[ball], large.centres[nearest[ball, k]])
     return np.flatnonzero(~beside.any(axis=1))

@@ -25,6 +25,8 @@ LEAST_LOOKS: Final = 5
 APART: Final = 1.5
 """Looks that leave within so many radii of each other, with no wall between them one radius before, leave through
 the same opening."""
+GOES_ON: Final = 5
+"""Balls of the same space in sight in front of an opening that make it none; a few may lie in a corner there."""
 NARROW: Final = 0.5
 """An opening narrower than so many radii of the tube is a hole in its wall."""
 SLIT: Final = 9.0
@@ -91,7 +93,8 @@ def _within(scene: RayScene, lumen: Lumen, opening: Opening, radius: float) -> b
     ways = lumen.balls.centres - opening.centre
     before = (ways @ opening.outward > radius) & (np.linalg.norm(ways, axis=1) < REACH * radius)
     targets = lumen.balls.centres[before]
-    return bool((~scene.blocked(np.tile(opening.centre, (len(targets), 1)), targets)).any())
+    seen = ~scene.blocked(np.tile(opening.centre, (len(targets), 1)), targets)
+    return int(seen.sum()) >= GOES_ON
 
 
 def _leave(scene: RayScene, balls: Balls) -> tuple[Floats, Floats, Floats]:

@@ -96,7 +96,8 @@ def test_ctrl_c_at_any_moment_of_the_start_leaves_nothing(session_name: str, tmp
         time.sleep(moment)
         process.send_signal(signal.SIGINT)
         done = finish(process)
-        assert done.status == 130, done
+        # Before our first line the interpreter itself ends by the signal, of which a shell makes 130 too.
+        assert done.status in (130, -signal.SIGINT), done
         assert "Traceback" not in done.stderr
         assert leftovers(session_name) == []
         assert processes_with(session_name) == []
