@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any, Final
 
-from cosim.evaluation_table import WIDTH, WORLDS
+from cosim.evaluation_table import WORLDS, wrapped
 from cosim.named_settings import write_value
 
 Row = Mapping[str, Any]
@@ -25,7 +24,7 @@ COLUMNS: Final = (
 
 def table_lines(report: Row) -> Iterator[str]:
     """The table."""
-    yield from _wrapped(_heading(report))
+    yield from wrapped(_heading(report))
     yield ""
     groups = [list(group) for _, group in groupby(report["rows"], key=lambda row: row["variant"])]
     width = max(len(rows[0]["variant"]) for rows in groups)
@@ -34,12 +33,7 @@ def table_lines(report: Row) -> Iterator[str]:
         cells = zip(_cells(rows), COLUMNS, strict=True)
         yield f"{rows[0]['variant']:{width}}" + "".join(f"{cell:>{size}}" for cell, (_, size) in cells)
     yield ""
-    yield from _wrapped(_legend(report, groups))
-
-
-def _wrapped(lines: Iterator[str]) -> Iterator[str]:
-    for line in lines:
-        yield from textwrap.wrap(line, WIDTH, subsequent_indent="  ", break_on_hyphens=False)
+    yield from wrapped(_legend(report, groups))
 
 
 def _heading(report: Row) -> Iterator[str]:

@@ -28,7 +28,7 @@ WORLDS: Final = {
 
 def table_lines(report: Row) -> Iterator[str]:
     """The table: for each level, or value of a sweep and level, the paper's rows and those that were flown."""
-    yield from _wrapped(heading(report))
+    yield from wrapped(heading(report))
     for (value, level), group in groupby(report["rows"], key=lambda row: (row.get("value"), row["level"])):
         flown = list(group)
         setting = flown[0].get("setting")
@@ -42,10 +42,11 @@ def table_lines(report: Row) -> Iterator[str]:
         for row in flown:
             yield _line(f"  {row['policy']}", row, width)
     yield ""
-    yield from _wrapped(legend(report))
+    yield from wrapped(legend(report))
 
 
-def _wrapped(lines: Iterator[str]) -> Iterator[str]:
+def wrapped(lines: Iterator[str]) -> Iterator[str]:
+    """Lines of a legend, broken at the table's width."""
     for line in lines:
         yield from textwrap.wrap(line, WIDTH, subsequent_indent="  ", break_on_hyphens=False)
 
@@ -121,7 +122,7 @@ def legend(report: Row) -> Iterator[str]:
 
 def map_lines(report: Row) -> Iterator[str]:
     """Success (%) over gain and compensation, a block for each pilot and level."""
-    yield from _wrapped(heading(report))
+    yield from wrapped(heading(report))
     rows = report["rows"]
     gains = sorted({row["gain"] for row in rows})
     cells = {(row["policy"], row["level"], row["gain"], row["compensation"]): row["success"] for row in rows}
@@ -132,4 +133,4 @@ def map_lines(report: Row) -> Iterator[str]:
         for c in sorted({row["compensation"] for row in rows}, reverse=True):
             yield f"{c:12g}      " + "".join(f"{100 * cells[name, level, gain, c]:7.1f}" for gain in gains)
     yield ""
-    yield from _wrapped(legend(report))
+    yield from wrapped(legend(report))

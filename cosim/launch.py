@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import click
 
@@ -36,15 +36,12 @@ from cosim.live_view import LiveView, ViewChoice
 from cosim.options import SHIPPED_MESH, SHIPPED_POLICY, FlightOptions
 from cosim.pilots import SHIPPED_CHECKPOINT, Pilot, PilotChoice, Terms, choose_pilot, read_pilot
 from cosim.recording import MANIFEST, Recorder
-from cosim.sessions import attached_session, offered_session, rendezvous_of
+from cosim.sessions import TUBE, attached_session, offered_session, rendezvous_of
 from cosim.supervise import PhysicsProcess, physics_command
 from cosim.versions import versions
 from meshes.tube import INDUSTRIAL
 from protocol.agent import AgentSession, SessionSettings
 from protocol.plant import PARAMETERS, ResetBatch
-
-TUBE: Final = 0
-"""Index under which the flight's tube is registered."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from cosim.integrity import check_data
 from cosim.launch import Continuation, launch
 from cosim.named_settings import NamedSettings
 from cosim.options import FlightOptions, Place, TubeChoice
-from cosim.runs import Run, read_run
+from cosim.runs import Run, payloads, read_run
 from cosim.scene import where_is
 from cosim.verify import find_tube
 from meshes.scale import MeanRadius
@@ -109,10 +109,9 @@ def options_of(run: Run) -> FlightOptions:
 
 def beginning(run: Run, steps: int) -> Continuation:
     """The first control steps of a run, to be flown again."""
-    size = run.records.dtype.itemsize
-    words = run.records[1 : steps + 1].view(np.uint8).reshape(steps, size)[:, :64]
-    commands = np.ascontiguousarray(words).view(np.float64).reshape(steps, 1, 8)
-    before = FlownBefore(commands, run.records["action"][1 : steps + 1].reshape(steps, 1).copy())
+    flown = run.records[1 : steps + 1]
+    commands, _ = payloads(flown)
+    before = FlownBefore(commands[:, None], flown["action"][:, None].copy())
     return Continuation(run.folder, before, run.records["chain"][steps].tobytes().hex())
 
 

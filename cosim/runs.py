@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import RunError
-from cosim.recording import FORMAT, MANIFEST, Column, record_dtype
+from cosim.recording import COMMAND_BYTES, FORMAT, MANIFEST, POSE_BYTES, Column, record_dtype
+from protocol.plant import COMMAND_WORDS
 
 CHUNK: Final = 8192
 """Records that are in memory at a time."""
@@ -74,6 +75,13 @@ def chunks(run: Run) -> Iterator[NDArray[np.void]]:
 def column(run: Run, name: str) -> NDArray[Any]:
     """One field of all records, (T, ...), as an array of its own."""
     return np.concatenate([records[name] for records in chunks(run)])
+
+
+def payloads(records: NDArray[np.void]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Command rows (T, 8) and pose rows (T, 16) of records (T,), as they crossed the protocol, bit for bit."""
+    rows = records.view(np.uint8).reshape(len(records), records.dtype.itemsize)
+    words = np.ascontiguousarray(rows[:, : COMMAND_BYTES + POSE_BYTES]).view(np.float64)
+    return words[:, :COMMAND_WORDS].copy(), words[:, COMMAND_WORDS:].copy()
 
 
 def element_names(column: Column) -> list[str]:

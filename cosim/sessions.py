@@ -19,6 +19,8 @@ from protocol.signals import held_signals
 
 Engine = Literal["bullet", "reference"]
 
+TUBE: Final = 0
+"""Index under which a flight's one tube is registered."""
 ATTACH_TIMEOUT: Final = 60.0
 """Patience for our own server's attach (s): it may compile first, on a machine that is busy."""
 

@@ -17,10 +17,10 @@ import numpy as np
 from cosim.errors import RunError
 from cosim.integrity import Finding, check_data
 from cosim.live import counting
-from cosim.recording import COMMAND_BYTES, PAYLOAD, POSE_BYTES
-from cosim.runs import Run, element_names, read_run
+from cosim.recording import PAYLOAD, POSE_BYTES
+from cosim.runs import Run, element_names, payloads, read_run
 from cosim.scene import where_is
-from cosim.sessions import ATTACH_TIMEOUT, physics_session, rendezvous_of
+from cosim.sessions import ATTACH_TIMEOUT, TUBE, physics_session, rendezvous_of
 from cosim.supervise import PhysicsProcess, physics_command
 from cosim.versions import versions
 from protocol.agent import AgentSession, SessionSettings
@@ -29,7 +29,6 @@ from protocol.plant import PARAMETERS, CommandBatch, ResetBatch, TubeReference
 
 POSE_FIELDS: Final = [name for name, *_ in PAYLOAD][4:]
 """Columns of a record that are words of the pose row."""
-TUBE: Final = 0
 MOST: Final = 8
 """Findings that are printed for people."""
 BAR_EVERY: Final = 500
@@ -147,14 +146,12 @@ def reset_of(run: Run) -> ResetBatch:
 
 
 def _compare(session: AgentSession, run: Run, resets: ResetBatch) -> Replay:
-    count, size = len(run.records), run.records.dtype.itemsize
-    payload = np.ascontiguousarray(
-        run.records.view(np.uint8).reshape(count, size)[:, : COMMAND_BYTES + POSE_BYTES]
-    )
-    sent, recorded = np.ascontiguousarray(payload[:, :COMMAND_BYTES]), payload[:, COMMAND_BYTES:].tobytes()
+    count = len(run.records)
+    sent, poses_then = payloads(run.records)
+    recorded = poses_then.tobytes()
     physics_s = 1e-9 * float(run.records["phases"][:, 1].sum())
     batch = CommandBatch.zeros(1)
-    row, commands = batch.raw.data.cast("B"), list(sent)
+    row, commands = batch.raw[0], list(sent)
     poses = session.reset(resets)
     answer = poses.raw.data.cast("B")
     index, same = 0, answer == recorded[:POSE_BYTES]

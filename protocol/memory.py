@@ -90,6 +90,16 @@ def _is_folder(path: Path) -> bool:
         return False
 
 
+def name_stands(descriptor: int, path: Path | None) -> bool:
+    """Tell whether a path still stands for the file that a descriptor is open on."""
+    if path is None:  # Windows keeps the name of shared memory for as long as anyone has it open
+        return True
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
+
+
 class Segment:
     """One mapped segment; made by `create_segment` and `open_segment`."""
 
@@ -137,12 +147,7 @@ class Segment:
 
     def stands(self) -> bool:
         """Tell whether the segment's name still stands for it, and not for a newer one or for nothing."""
-        if self.path is None:  # Windows keeps the name of shared memory for as long as anyone has it open
-            return True
-        try:
-            return os.path.samestat(os.fstat(self._descriptor), self.path.stat())
-        except FileNotFoundError:
-            return False
+        return name_stands(self._descriptor, self.path)
 
     def unlink(self) -> None:
         """Remove the segment's name, unless it is gone already or stands for a newer segment.

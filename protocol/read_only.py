@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from protocol.errors import SessionError
-from protocol.memory import Rendezvous, is_ours, open_segment, segment_path
+from protocol.memory import Rendezvous, is_ours, name_stands, open_segment, segment_path
 
 _NO_DESCRIPTOR: Final = -1
 _CLOSED: Final = -2
@@ -50,12 +50,7 @@ class ReadOnlySegment:
 
     def stands(self) -> bool:
         """Tell whether the segment's name still stands for it, and not for nothing or for a newer one."""
-        if self.path is None:
-            return True
-        try:
-            return os.path.samestat(os.fstat(self._descriptor), self.path.stat())
-        except FileNotFoundError:
-            return False
+        return name_stands(self._descriptor, self.path)
 
     def close(self) -> None:
         """Unmap; every view of it must have been released before. Idempotent."""

@@ -16,7 +16,7 @@ from protocol.conformance.flight import meeting
 from protocol.conformance.raw_physics import RawPhysics, Request
 from protocol.conformance.rig import Rig
 from protocol.conformance.rule import Failure, Level, Skip, agent_rule, demand
-from protocol.conformance.scenes import ALLOWANCE_S, FAULT_STATES, UNDER_WAY
+from protocol.conformance.scenes import ALLOWANCE_S, UNDER_WAY, in_fault_states
 from protocol.conformance.stand_in import StandIn
 from protocol.errors import Refusal
 from protocol.layout import Farewell, Op
@@ -28,10 +28,6 @@ LONG_PAUSE_S: Final = 1.0
 UNKNOWN_CODE: Final = 77
 """A code of refusal that only a later version could know."""
 _WITHIN: Final = f"within 100 ms (+{ALLOWANCE_S * 1e3:.0f})"
-
-
-def _covers(event: Event) -> tuple[tuple[State, Event], ...]:
-    return tuple((state, event) for state in FAULT_STATES)
 
 
 # --- death and farewell ---
@@ -79,7 +75,7 @@ def _kill_unreaped(physics: RawPhysics) -> None:
     ROBUSTNESS,
     "10",
     f"a physics side killed in any state ends the agent {_WITHIN}, with both segments removed",
-    covers=_covers(Event.LOSS)[1:],
+    covers=in_fault_states(Event.LOSS)[1:],
 )
 def _physics_killed(rig: Rig) -> str:
     """Each state is a session of its own; the exit status is not 0, but for a goodbye that finds nobody."""
@@ -115,7 +111,7 @@ def _physics_pid_reused(rig: Rig) -> None:
     ROBUSTNESS,
     "8",
     f"a farewell of the physics side, of any kind and in any state, ends the agent {_WITHIN}",
-    covers=_covers(Event.FAREWELL),
+    covers=in_fault_states(Event.FAREWELL),
 )
 def _physics_farewell(rig: Rig) -> str:
     """Also one without a header, while the session is only on offer."""

@@ -32,6 +32,7 @@ from protocol.conformance.scenes import (
     at_work,
     command_path,
     hand_over,
+    in_fault_states,
     ready,
     ring,
     scene,
@@ -50,10 +51,6 @@ _BOUND: Final = NOTICE_S + ALLOWANCE_S
 _KINDS: Final = (Farewell.STOPPED, Farewell.FAILED, Farewell.VIOLATION, Farewell.HANDSHAKE)
 
 
-def _covers(event: Event) -> tuple[tuple[State, Event], ...]:
-    return tuple((state, event) for state in FAULT_STATES)
-
-
 # --- death ---
 
 
@@ -63,7 +60,7 @@ def _covers(event: Event) -> tuple[tuple[State, Event], ...]:
     "10",
     "an agent killed in any state, or gone without a word, is noticed within 100 ms "
     f"(+{ALLOWANCE_S * 1e3:.0f}): names removed, server ends",
-    covers=_covers(Event.LOSS),
+    covers=in_fault_states(Event.LOSS),
 )
 def _agent_killed(rig: Rig) -> str:
     took = {state: _dies(rig, state, StandIn.kill) for state in FAULT_STATES}

@@ -47,6 +47,11 @@ UNDER_WAY: Final = {
 """The states in which a request is under way, with its op."""
 
 
+def in_fault_states(event: Event) -> tuple[tuple[State, Event], ...]:
+    """What a rule covers that lets an event come in each of the FAULT_STATES."""
+    return tuple((state, event) for state in FAULT_STATES)
+
+
 @dataclass
 class Scene:
     """One session in one state."""

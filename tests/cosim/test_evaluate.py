@@ -7,13 +7,13 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-from flights import DEADLINE, command, environment, leftovers, run_cosim, run_here
+from flights import DEADLINE, command, environment, leftovers, run_cosim, run_here, wait_until
 
 from agent_client.conditions import CONDITIONS, HARD, Conditions
 from agent_client.evaluation import wilson
@@ -319,14 +319,6 @@ def children(pid: int) -> list[int]:
             if int(parent) == pid and state != "Z":
                 found.append(int(entry.name))
     return found
-
-
-def wait_until(holds: Callable[[], object]) -> None:
-    """Poll until something holds, or fail at the deadline."""
-    deadline = time.monotonic() + DEADLINE
-    while not holds():
-        assert time.monotonic() < deadline, "deadline passed"
-        time.sleep(0.02)
 
 
 @contextmanager

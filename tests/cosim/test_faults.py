@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flights import DEADLINE, ROOT, Done, command, environment, leftovers, run_cosim
+from flights import DEADLINE, ROOT, Done, command, environment, gone, leftovers, run_cosim, wait_until
 
 from cosim.runs import read_run
 
@@ -41,14 +41,6 @@ def flying(session: str, folder: Path, *arguments: str) -> Iterator[subprocess.P
         process.communicate()
 
 
-def wait_until(holds: Callable[[], bool]) -> None:
-    """Poll until something holds, or fail at the deadline."""
-    deadline = time.monotonic() + DEADLINE
-    while not holds():
-        assert time.monotonic() < deadline, "deadline passed"
-        time.sleep(0.02)
-
-
 def recorded(folder: Path) -> int:
     """Whole records on disk so far; none before the manifest, which is written after the log is opened."""
     return len(read_run(folder).records) if (folder / "manifest.json").exists() else 0
@@ -57,14 +49,6 @@ def recorded(folder: Path) -> int:
 def physics_pid(folder: Path) -> int:
     """Process id of the physics process of a flight."""
     return int(read_run(folder).manifest["physics_pid"])
-
-
-def gone(pid: int) -> bool:
-    """Whether a process has ended (a zombie has)."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] in "ZX"
-    except FileNotFoundError:
-        return True
 
 
 def test_ctrl_c_saves_the_run_and_ends_both_processes(session_name: str, tmp_path: Path) -> None:

@@ -7,9 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +17,7 @@ pytest.importorskip("stable_baselines3", reason="the extra 'train' is not instal
 
 import gymnasium
 import stable_baselines3.common.env_checker
-from flights import DEADLINE, environment, leftovers
+from flights import DEADLINE, environment, gone, leftovers, wait_until
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
@@ -30,14 +28,6 @@ from protocol.errors import PeerLost
 
 KINEMATIC, COSIM = "cosim/TubeKinematic-v0", "cosim/TubeCosim-v0"
 SHORT = TubeRecipe(lengths=(4.0,))
-
-
-def gone(pid: int) -> bool:
-    """Whether a process has ended (a zombie has)."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] in "ZX"
-    except FileNotFoundError:
-        return True
 
 
 @pytest.fixture
@@ -231,11 +221,3 @@ class Program:
             process.kill()
             process.wait()
         self.returncode = process.returncode
-
-
-def wait_until(holds: Callable[[], bool]) -> None:
-    """Poll until something holds, or fail at the deadline."""
-    deadline = time.monotonic() + DEADLINE
-    while not holds():
-        assert time.monotonic() < deadline, "deadline passed"
-        time.sleep(0.02)

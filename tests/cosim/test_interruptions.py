@@ -7,11 +7,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from flights import DEADLINE, ROOT, Done, command, environment, leftovers
+from flights import DEADLINE, ROOT, Done, command, environment, leftovers, wait_until
 
 from cosim.runs import read_run
 from protocol.leftovers import leftovers as dead_sessions
@@ -154,11 +153,3 @@ def test_what_a_killed_launch_left_without_physics_is_known_as_dead(
 def dead_of(session: str) -> list[Rendezvous]:
     """The names of dead sessions that contain that of a session."""
     return [one.rendezvous for one in dead_sessions() if session in str(one.rendezvous)]
-
-
-def wait_until(holds: Callable[[], bool]) -> None:
-    """Poll until something holds, or fail at the deadline."""
-    deadline = time.monotonic() + DEADLINE
-    while not holds():
-        assert time.monotonic() < deadline, "deadline passed"
-        time.sleep(0.02)

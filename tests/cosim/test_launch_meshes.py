@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from flights import ROOT, Done, run_cosim, run_here
+from flights import ROOT, Done, manifest_of, run_cosim, run_here
 from tubular import Mesh, circle, cut, extrude, in_tube, join, junction, line, rectangle, s_bend
 
 from agent_client.flight import FlightResult, fly
@@ -78,11 +77,6 @@ def wavy(sides: int = 24, radius: float = 1.0) -> Mesh:
     return extrude(
         radius * np.stack([x, np.sin(x / 2.5), 0.6 * np.sin(x / 3.0)], axis=1), circle(sides, radius)
     )
-
-
-def manifest_of(folder: Path) -> dict[str, Any]:
-    """The manifest of a run."""
-    return dict(json.loads((folder / "manifest.json").read_text()))
 
 
 @needs_real

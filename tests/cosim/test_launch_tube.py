@@ -6,10 +6,9 @@ import json
 import shlex
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
-from flights import Done, run_cosim, run_here
+from flights import Done, manifest_of, run_cosim, run_here
 
 from agent_client.tubes import TubeRecipe, draw_tube
 from cosim.inputs import setting_notes
@@ -17,11 +16,6 @@ from cosim.named_settings import NamedSettings
 from cosim.options import FlightOptions, TubeChoice
 from cosim.runs import read_run
 from meshes.tube import read_tube
-
-
-def manifest_of(folder: Path) -> dict[str, Any]:
-    """The manifest of a run."""
-    return dict(json.loads((folder / "manifest.json").read_text()))
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,8 @@ import json
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -73,3 +75,24 @@ def run_here(*arguments: str) -> Done:
 def leftovers(session: str) -> list[str]:
     """Shared memory whose name contains that of the session."""
     return [path.name for path in Path("/dev/shm").iterdir() if session in path.name]
+
+
+def manifest_of(folder: Path) -> dict[str, Any]:
+    """The manifest of a run."""
+    return dict(json.loads((folder / "manifest.json").read_text()))
+
+
+def gone(pid: int) -> bool:
+    """Whether a process has ended (a zombie has)."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] in "ZX"
+    except FileNotFoundError:
+        return True
+
+
+def wait_until(holds: Callable[[], object]) -> None:
+    """Poll until something holds, or fail at the deadline."""
+    deadline = time.monotonic() + DEADLINE
+    while not holds():
+        assert time.monotonic() < deadline, "deadline passed"
+        time.sleep(0.02)
