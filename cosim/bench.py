@@ -25,16 +25,20 @@ LAYERS: Final = (37, 256, 128, 36)
 """The paper's network."""
 
 
-def bench(*, as_json: bool, quick: bool, training: bool = False) -> None:
+def bench(*, as_json: bool, quick: bool, training: bool = False, runs: bool = False) -> None:
     """Measure and print: a table for people, or one JSON object.
 
     Args:
         as_json: one JSON object on stdout and nothing else.
         quick: fewer samples and repeats.
         training: the speed of training instead of the loop's.
+        runs: what looking at a flight, proving it and reporting it cost instead.
     """
     if training:
         bench_training(as_json=as_json, quick=quick)
+        return
+    if runs:
+        bench_runs(as_json=as_json, quick=quick)
         return
     samples, repeats = (2_000, 1) if quick else (20_000, 5)
 
@@ -60,6 +64,14 @@ def bench_training(*, as_json: bool, quick: bool) -> None:
 
     figures = measure_training(LOOK if quick else MEASUREMENT, lambda text: click.echo(text, err=True))
     click.echo(json.dumps({"training": figures}) if as_json else training_table(figures))
+
+
+def bench_runs(*, as_json: bool, quick: bool) -> None:
+    """Measure what surrounds a flight and print, as `bench` does."""
+    from cosim.bench_runs import LOOK, MEASUREMENT, measure_runs, runs_table
+
+    figures = measure_runs(LOOK if quick else MEASUREMENT, lambda text: click.echo(text, err=True))
+    click.echo(json.dumps({"runs": figures}) if as_json else runs_table(figures))
 
 
 def measure_loop(repeats: int) -> dict[str, Any]:

@@ -112,10 +112,11 @@ def doctor(clean: bool, as_json: bool) -> None:
         sys.exit(EXIT_FAILED_CHECK)
 
 
-@command(short_help="Measure round trips, control loop, start-up or training.")
+@command(short_help="Measure round trips, control loop, start-up, runs, training.")
 @json_option
 @option("--quick", is_flag=True, help="Fewer samples: a look, not a measurement.")
 @option("--training", is_flag=True, help="The speed of training instead: environment, PPO, past the paper.")
+@option("--runs", is_flag=True, help="What surrounds a flight instead: live viewer, verify, report; bars.")
 @option(
     "--protocol",
     is_flag=True,
@@ -130,7 +131,13 @@ def doctor(clean: bool, as_json: bool) -> None:
     help=f"With --protocol: these ways alone, out of {', '.join(WAYS)} [default: all].",
 )
 def bench(
-    as_json: bool, quick: bool, training: bool, protocol: bool, png: Path | None, only: str | None
+    as_json: bool,
+    quick: bool,
+    training: bool,
+    runs: bool,
+    protocol: bool,
+    png: Path | None,
+    only: str | None,
 ) -> None:
     """Measure the protocol's round trip, the whole control loop and the start-up, side by side in one run.
 
@@ -138,8 +145,10 @@ def bench(
     cosim bench --quick
     cosim bench --protocol --png round_trips.png   # against UDP, ZeroMQ, gRPC, ...
     """
-    if training and protocol:
-        raise click.UsageError("--training and --protocol: expected one of them, found both")
+    parts = {"--training": training, "--runs": runs, "--protocol": protocol}
+    if sum(parts.values()) > 1:
+        found = " and ".join(name for name, given in parts.items() if given)
+        raise click.UsageError(f"{', '.join(parts)}: expected one of them, found {found}")
     if not protocol and (png is not None or only is not None):
         raise click.UsageError(
             f"--{'png' if png is not None else 'only'} is an option of --protocol, which is not given"
@@ -152,7 +161,7 @@ def bench(
         return
     from cosim.bench import bench as run
 
-    run(as_json=as_json, quick=quick, training=training)
+    run(as_json=as_json, quick=quick, training=training, runs=runs)
 
 
 @command(short_help="Print what makes a shell complete cosim's commands.")
