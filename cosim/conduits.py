@@ -95,6 +95,7 @@ def read_conduit(options: FlightOptions, mesh: Path, folder: Path, body_radius: 
     reference = TubeReference(str(tube.path.resolve()), tube.axes, tube.scale, tube.sha256)
     described = _describe(tube.path, reference, tube.centreline_path, tube.centreline_sha256, tube.length)
     described["found"] = None if found is None else _describe_found(tube, found)
+    described["companions"] = dict(tube.wall.companions)
     notes = (*_scale_notes(tube, options), *(() if found is None else _found_notes(tube, found, options)))
     return Conduit(
         MeshGeometry([tube]), reference, tube.length, {"mesh": described, "tube": None}, notes, written

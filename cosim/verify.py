@@ -23,6 +23,7 @@ from cosim.scene import where_is
 from cosim.sessions import ATTACH_TIMEOUT, TUBE, physics_session, rendezvous_of
 from cosim.supervise import PhysicsProcess, physics_command
 from cosim.versions import versions
+from meshes.gltf import locate
 from protocol.agent import AgentSession, SessionSettings
 from protocol.layout import Axes
 from protocol.plant import PARAMETERS, CommandBatch, ResetBatch, TubeReference
@@ -94,7 +95,14 @@ def find_tube(run: Run, mesh: Path | None) -> tuple[TubeReference | None, list[F
         if hashed != described["centreline_sha256"]:
             expected = f"SHA-256 {described['centreline_sha256'][:16]}…"
             findings.append(Finding(f"centreline {centreline}", expected, hashed[:16] + "…"))
-    if found != described["sha256"]:
+    same = found == described["sha256"]
+    for name, sha256 in described.get("companions", {}).items():
+        part = locate(path, name)
+        hashed = _file_hash(part)
+        if hashed != sha256:
+            findings.append(Finding(f"mesh {part}", f"SHA-256 {sha256[:16]}…", hashed[:16] + "…"))
+            same = False
+    if not same:
         return None, findings
     reference = TubeReference(
         str(path.resolve()), Axes[described["axes"]].name, described["scale"], described["sha256"]

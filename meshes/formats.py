@@ -6,10 +6,12 @@ unit nor the up-axis of a .dae.
 
 from __future__ import annotations
 
+import hashlib
 import io
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 from xml.etree import ElementTree
 
 import numpy as np
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 
 from meshes.errors import MeshReadError
 from meshes.geometry import Floats
+from meshes.gltf import read_buffers, read_document
 from meshes.obj import first_of_each, parse_obj, weld
 
 Axes = Literal["zup", "yup"]
@@ -26,6 +29,20 @@ AxesChoice = Literal["auto", "zup", "yup"]
 
 FORMATS: Final = (".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 """Suffixes of the mesh formats that are read."""
+
+_BEGINNINGS: Final = {
+    b"glTF": ".glb",
+    b"ply": ".ply",
+    b"OFF": ".off",
+    b"PK\x03\x04": "an archive (.zip); unpack it",
+    b"version https://git-lfs": "a pointer of Git LFS; fetch the file itself with git lfs pull",
+}
+"""How files begin that are found under wrong names, and what they are."""
+
+_STL_HEADER: Final = 84
+"""Bytes of a binary .stl before its triangles."""
+_STL_TRIANGLE: Final = 50
+"""Bytes of each."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +69,8 @@ class MeshData:
     duplicate_faces: int
     """How many were dropped, since others have the same corners."""
     stated: Stated
+    companions: Mapping[str, str] = field(default_factory=dict)
+    """SHA-256 of the further files that hold vertices or faces, by the names under which the file has them."""
 
 
 def parse_mesh(content: bytes, path: Path) -> MeshData:
@@ -61,18 +80,57 @@ def parse_mesh(content: bytes, path: Path) -> MeshData:
         MeshReadError: not a readable mesh of this format.
     """
     suffix = path.suffix.lower()
-    if suffix == ".obj":
-        data = parse_obj(content, path)
-        return MeshData(data.vertices, data.faces.astype(np.int64), data.duplicate_faces, UNSTATED)
     if suffix not in FORMATS:
         raise MeshReadError(
             f"{path}: expected a mesh format that can be read ({', '.join(FORMATS)}), found {path.suffix!r}"
         )
-    vertices, faces = _parse_by_trimesh(content, path)
+    _check_beginning(content, suffix, path)
+    if suffix == ".obj":
+        data = parse_obj(content, path)
+        return MeshData(data.vertices, data.faces.astype(np.int64), data.duplicate_faces, UNSTATED)
+    if suffix == ".stl":
+        content = _whole_stl(content, path)
+    buffers = read_buffers(read_document(content, path), path) if suffix in (".glb", ".gltf") else {}
+    vertices, faces = _parse_by_trimesh(content, path, buffers)
     if not np.isfinite(vertices).all():
         raise MeshReadError(f"{path}: expected finite coordinates, found NaN or infinity")
-    kept = first_of_each(weld(vertices)[faces]) if len(faces) else np.empty(0, np.int64)
-    return MeshData(vertices, faces[kept], len(faces) - len(kept), _stated(content, suffix))
+    places = weld(vertices)
+    _, first = np.unique(places, return_index=True)
+    faces = places[faces]
+    kept = first_of_each(faces) if len(faces) else np.empty(0, np.int64)
+    companions = {name: hashlib.sha256(data).hexdigest() for name, data in buffers.items()}
+    return MeshData(
+        vertices[first], faces[kept], len(faces) - len(kept), _stated(content, suffix), companions
+    )
+
+
+def _check_beginning(content: bytes, suffix: str, path: Path) -> None:
+    """Refuse what is empty, or begins as a file of another kind does."""
+    if not content.strip():
+        raise MeshReadError(f"{path}: expected a mesh of format {suffix}, found an empty file")
+    for beginning, kind in _BEGINNINGS.items():
+        if content.startswith(beginning) and not kind.startswith(suffix):
+            raise MeshReadError(f"{path}: expected a mesh of format {suffix}, found what begins as {kind}")
+
+
+def _whole_stl(content: bytes, path: Path) -> bytes:
+    """A .stl that is not cut short, its text in UTF-8; in whatever encoding its name of the solid may be."""
+    if content.lstrip()[:5].lower() == b"solid" and b"facet" in content[:2000]:
+        if b"endsolid" not in content[-2000:].lower():
+            raise MeshReadError(f"{path}: expected 'endsolid' at the end, found none: the file is cut short")
+        try:
+            content.decode()
+        except UnicodeDecodeError:
+            return content.decode("latin-1").encode()
+        return content
+    count = int.from_bytes(content[80:84], "little")
+    expected = _STL_HEADER + count * _STL_TRIANGLE
+    if len(content) < max(expected, _STL_HEADER + _STL_TRIANGLE):
+        raise MeshReadError(
+            f"{path}: not a readable mesh of format .stl: {count:,} triangles stated, which take {expected:,} bytes, "
+            f"found {len(content):,}: cut short, or no .stl"
+        )
+    return content
 
 
 def _stated(content: bytes, suffix: str) -> Stated:
@@ -100,23 +158,30 @@ def _stated_by_collada(content: bytes) -> Stated:
     )
 
 
-def _parse_by_trimesh(content: bytes, path: Path) -> tuple[Floats, NDArray[np.int64]]:
-    """Vertices (V, 3) and triangles (F, 3) of all objects of the scene, in their places."""
+def _parse_by_trimesh(
+    content: bytes, path: Path, buffers: Mapping[str, bytes]
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Vertices (V, 3) and triangles (F, 3) of all objects of the scene, in their places.
+
+    Args:
+        content: of the file.
+        path: its name.
+        buffers: contents of the files that a glTF document names.
+    """
     import trimesh  # here, since it takes half a second that an .obj does not need
 
     suffix = path.suffix.lower()
+    # Unprocessed: trimesh would drop vertices that are not finite, and the faces at them.
+    how: dict[str, Any] = {"file_type": suffix[1:], "process": False}
+    if suffix in (".glb", ".gltf"):
+        how |= {"resolver": buffers, "skip_materials": True}
     try:
-        # A .gltf may keep its buffers in files beside it.
-        resolver = trimesh.resolvers.FilePathResolver(str(path.absolute()))
-        scene = trimesh.load_scene(io.BytesIO(content), file_type=suffix[1:], resolver=resolver)
-        mesh = scene.to_mesh()
+        mesh = trimesh.load_scene(io.BytesIO(content), **how).to_mesh()
         vertices = np.array(mesh.vertices, dtype=np.float64).reshape(-1, 3)
         faces = np.array(mesh.faces, dtype=np.int64).reshape(-1, 3)
-    except ImportError as error:  # asked for by rare contents only, damaged ones among them
-        raise MeshReadError(
-            f"{path}: not a readable mesh of format {suffix}; if the file is whole, reading it needs the package "
-            f"{error.name}, which is not installed"
-        ) from error
     except Exception as error:  # every loader of trimesh fails in its own way
-        raise MeshReadError(f"{path}: not a readable mesh of format {suffix} ({error})") from error
+        reason = f" ({error})" if str(error) and not isinstance(error, ImportError) else ""
+        raise MeshReadError(
+            f"{path}: not a readable mesh of format {suffix}: damaged, cut short, or of another format{reason}"
+        ) from error
     return vertices, faces

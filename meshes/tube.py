@@ -110,8 +110,12 @@ def read_tube(
     Raises:
         MeshReadError: either file cannot be read.
         CentrelineError: the centreline cannot be found, is no single open path, has a length out of `LENGTHS`,
-            or leaves the tube.
+            or leaves the tube; or one is named, and ends for another.
     """
+    if centreline is not None and not (entry is None and exit is None):
+        raise CentrelineError(
+            f"{centreline}: expected a centreline or an entry and an exit, found both: a centreline has its own ends"
+        )
     if isinstance(scale, MeanRadius):
         return _read_as_wide(mesh, scale.metres, centreline, axes, start_end, entry, exit)
     return _tube_in(read_wall(mesh, axes, scale), centreline, start_end, entry, exit)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from meshes.embree import RayScene
 from meshes.errors import MeshReadError
@@ -37,6 +39,8 @@ class Wall:
     """How many faces were dropped, since others have the same corners."""
     stated: Stated
     """What the file states of its axes and unit, whether it was followed or not."""
+    companions: Mapping[str, str] = field(default_factory=dict)
+    """Further files that hold vertices or faces, see `MeshData`."""
 
     @cached_property
     def scene(self) -> RayScene:
@@ -91,6 +95,7 @@ def read_wall(path: str | Path, axes: AxesChoice = "auto", scale: float | None =
         scale=scale,
         duplicate_faces=data.duplicate_faces,
         stated=data.stated,
+        companions=data.companions,
     )
 
 
@@ -130,7 +135,16 @@ def to_world(points: Floats, axes: Axes, scale: float, path: Path) -> Floats:
 
 def place(wall: Wall, point: Floats) -> str:
     """A point (3,), metres, world frame, in the coordinates of the file, for people."""
-    return "({:.4g}, {:.4g}, {:.4g})".format(*wall.to_file(point[None])[0])
+    return place_in_file(wall, wall.to_file(point[None])[0])
+
+
+def place_in_file(wall: Wall, coordinates: ArrayLike) -> str:
+    """A point (3,) in the coordinates of the file, for people: to a ten thousandth of the wall's extent, so that
+    a place in a survey's coordinates is told from the next."""
+    extent = float(np.linalg.norm(np.ptp(wall.vertices, axis=0))) / wall.scale
+    digits = 4 - math.floor(math.log10(extent)) if extent > 0.0 else 4
+    rounded = np.round(np.asarray(coordinates, dtype=np.float64), digits) + 0.0  # no -0
+    return "({:.12g}, {:.12g}, {:.12g})".format(*rounded)
 
 
 def in_units(wall: Wall, metres: float) -> str:

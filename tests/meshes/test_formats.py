@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import struct
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from tubular import Mesh, circle, extrude, line, s_bend
 from meshes.errors import MeshReadError
 from meshes.formats import FORMATS
 from meshes.tube import read_tube
-from meshes.wall import read_wall
+from meshes.wall import place, read_wall
 
 TUBE = extrude(line([0.0, 0.0, 0.0], [8.0, 0.0, 0.0], 9), circle(16))
 """From the origin along x, 1 m wide."""
@@ -123,6 +124,40 @@ def test_transforms_of_scenes_are_applied(tmp_path: Path) -> None:
     np.testing.assert_allclose(box_of(path, axes="zup"), [[10.0, -1.0, -1.0], [26.0, 1.0, 1.0]], atol=1e-5)
 
 
+def test_a_gltf_is_all_of_its_files(tmp_path: Path) -> None:
+    """The buffer of a file with a blank in its name, as Blender writes it: read, hashed, and missed when gone."""
+    path = write_gltf(tmp_path / "my tube.gltf", TUBE, translation=[0.0, 0.0, 0.0], scale=[1.0, 1.0, 1.0])
+    path.write_text(path.read_text().replace("my tube.bin", "my%20tube.bin"))
+    wall = read_wall(path)
+    assert len(wall.faces) == len(TUBE[1])
+    buffer = tmp_path / "my tube.bin"
+    assert wall.companions == {"my%20tube.bin": hashlib.sha256(buffer.read_bytes()).hexdigest()}
+    buffer.write_bytes(buffer.read_bytes()[:100])
+    with pytest.raises(MeshReadError, match=r"bytes in .*my tube\.bin, found 100"):
+        read_wall(path)
+    buffer.unlink()
+    with pytest.raises(MeshReadError, match=r"another file: .*my tube\.bin: no such file"):
+        read_wall(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "KHR_draco_mesh_compression"),
+        ({"accessors": [{"normalized": True}, {}]}, "quantised"),
+        ({"meshes": [{"primitives": [{"mode": 6, "attributes": {"POSITION": 0}}]}]}, "fan"),
+        ({"buffers": [{"byteLength": 1, "uri": "https://example.org/a.bin"}]}, "beside it"),
+        ({"meshes": 3}, "damaged"),
+    ],
+)
+def test_gltf_that_would_be_misread_is_refused(change: dict[str, object], words: str, tmp_path: Path) -> None:
+    """Compressed or quantised vertices, and fans, become other triangles, or none, where nobody looks."""
+    path = write_gltf(tmp_path / "odd.gltf", TUBE, translation=[0.0, 0.0, 0.0], scale=[1.0, 1.0, 1.0])
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(MeshReadError, match=words):
+        read_wall(path)
+
+
 def test_several_objects_of_a_scene_are_one_wall(tmp_path: Path) -> None:
     """Two halves of a tube as two nodes of a .glb: one wall with the faces of both, each in its place."""
     half = trimesh.Trimesh(*extrude(line([0, 0, 0], [4, 0, 0], 5), circle(16)), process=False)
@@ -204,18 +239,83 @@ def _binary(path: Path) -> None:
     path.write_bytes(struct.pack("<80sI", b"", 7))
 
 
+def _text(path: Path) -> None:
+    path.write_text("solid tube\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\n")
+
+
+def _empty(path: Path) -> None:
+    path.write_bytes(b"\n")
+
+
+def _pointer(path: Path) -> None:
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 7\n")
+
+
+def _misnamed(path: Path) -> None:
+    path.write_text("ply\nformat ascii 1.0\n")
+
+
 @pytest.mark.parametrize(
-    ("suffix", "damage"), [(".glb", _truncated), (".ply", _truncated), (".stl", _binary)]
+    ("suffix", "damage", "words"),
+    [
+        (".glb", _truncated, "cut short"),
+        (".ply", _truncated, "cut short"),
+        (".off", _truncated, "cut short"),
+        (".gltf", _truncated, "cut short"),
+        (".stl", _truncated, "cut short"),
+        (".stl", _binary, "7 triangles stated, which take 434 bytes, found 84: cut short"),
+        (".stl", _text, "cut short"),
+        (".dae", _empty, "empty"),
+        (".obj", _pointer, "git lfs pull"),
+        (".stl", _misnamed, "begins as .ply"),
+    ],
 )
 def test_damaged_files_are_refused_by_name(
-    suffix: str, damage: Callable[[Path], None], tmp_path: Path
+    suffix: str, damage: Callable[[Path], None], words: str, tmp_path: Path
 ) -> None:
-    """Cut short or empty: one sentence that names the file and its format."""
+    """Cut short, empty or of another kind: one sentence that names the file and what is wrong."""
     path = tmp_path / f"damaged{suffix}"
-    trimesh.Trimesh(*TUBE, process=False).export(path)
+    if suffix in (".glb", ".gltf", ".ply", ".off", ".stl"):
+        path.write_bytes(_exported(suffix))
     damage(path)
-    with pytest.raises(MeshReadError, match=rf"damaged\{suffix}"):
+    with pytest.raises(MeshReadError, match=rf"damaged\{suffix}.*{words}"):
         read_wall(path)
+
+
+def _exported(suffix: str) -> bytes:
+    written = trimesh.Trimesh(*TUBE, process=False).export(file_type=suffix[1:])
+    if isinstance(written, dict):  # a .gltf and its buffer
+        return bytes(written["model.gltf"])
+    return written.encode() if isinstance(written, str) else bytes(written)
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".ply"])
+def test_coordinates_that_are_no_numbers_are_refused(suffix: str, tmp_path: Path) -> None:
+    """A vertex that is not a number is a damaged file, not a hole in the wall."""
+    vertices, faces = TUBE[0].copy(), TUBE[1]
+    vertices[5] = np.nan
+    path = tmp_path / f"tube{suffix}"
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
+    with pytest.raises(MeshReadError, match="finite"):
+        read_wall(path)
+
+
+def test_an_stl_may_be_named_in_any_encoding(tmp_path: Path) -> None:
+    """The name of the solid in Latin-1; its vertices, one for each corner in the file, are joined again."""
+    text = trimesh.Trimesh(*TUBE, process=False).export(file_type="stl_ascii")
+    path = tmp_path / "tube.stl"
+    path.write_bytes(text.replace("solid ", "solid Röhre ").encode("latin-1"))
+    wall = read_wall(path)
+    assert (len(wall.vertices), len(wall.faces)) == (len(TUBE[0]), len(TUBE[1]))
+
+
+def test_places_are_named_to_a_share_of_the_extent(tmp_path: Path) -> None:
+    """A place in a survey's coordinates is told from the next, and one near the origin has no more digits."""
+    path = tmp_path / "tube.obj"
+    lines = [f"v {x + 450000.0:.3f} {y + 5600000.0:.3f} {z:.3f}" for x, y, z in TUBE[0]]
+    path.write_text("\n".join(lines + [f"f {a} {b} {c}" for a, b, c in TUBE[1] + 1]))
+    wall = read_wall(path)
+    assert place(wall, np.array([450003.21, 5600000.0, -0.0])) == "(450003.21, 5600000, 0)"
 
 
 def test_damaged_collada_is_refused_by_name(tmp_path: Path) -> None:
