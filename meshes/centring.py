@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from scipy.signal import savgol_filter  # type: ignore[import-untyped]
 
 from meshes.embree import RayScene
 from meshes.geometry import Floats
@@ -17,6 +16,7 @@ from meshes.sections import (
     offsets_of_centres,
     ring_directions,
 )
+from meshes.smoothing import fit_locally
 from meshes.swept import unit_tangents
 
 STEP: Final = 0.2
@@ -186,7 +186,7 @@ def _settle(scene: RayScene, tail: Floats) -> Floats:
 def _smooth(points: Floats, radii: float) -> Floats:
     """A cubic through each point's neighbours within so many radii to either side."""
     window = _window(points, radii)
-    return savgol_filter(points, window, 3, axis=0) if window > 3 else points
+    return fit_locally(points, window, 3) if window > 3 else points
 
 
 def _tangents(points: Floats) -> Floats:
@@ -194,7 +194,7 @@ def _tangents(points: Floats) -> Floats:
     window = _window(points, TANGENT)
     if window <= 3:
         return unit_tangents(points)
-    along = savgol_filter(points, window, 3, deriv=1, axis=0)
+    along = fit_locally(points, window, 3, derivative=1)
     tangents: Floats = along / np.linalg.norm(along, axis=1, keepdims=True)
     return tangents
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.signal import savgol_filter  # type: ignore[import-untyped]
 
 from meshes.centring import wall_ahead
 from meshes.closest import build_tree, wall_distance
@@ -17,6 +16,7 @@ from meshes.geometry import Floats
 from meshes.lumen import draw_balls
 from meshes.openings import Opening
 from meshes.sections import Rings, close_sideways, measure_rings, resample_evenly
+from meshes.smoothing import fit_locally
 from meshes.swept import unit_tangents
 from meshes.tube import Tube
 from meshes.tube_ends import choose_lumen
@@ -169,9 +169,7 @@ def curvature_and_torsion(points: Floats, step: float, radius: float) -> tuple[F
     window = min(2 * max(round(BEND_WINDOW * radius / step), 3) + 1, (len(points) - 1) // 2 * 2 + 1)
     if window < 5:
         return np.zeros(len(points)), np.full(len(points), np.nan)
-    first, second, third = (
-        savgol_filter(points, window, 4, deriv=order, delta=step, axis=0) for order in (1, 2, 3)
-    )
+    first, second, third = (fit_locally(points, window, 4, order, step) for order in (1, 2, 3))
     cross = np.cross(first, second)
     size = np.linalg.norm(cross, axis=1)
     curvature: Floats = size / np.linalg.norm(first, axis=1) ** 3
