@@ -54,7 +54,7 @@ def overview(points: Floats, aspect: float) -> Camera:
         aspect: width over height of the picture.
     """
     points = points[:: max(1, len(points) // POINTS)]
-    apart = points - np.roll(points, len(points) // 2, axis=0)
+    apart = points - points.mean(axis=0)
     whole = max(float(np.linalg.norm(apart, axis=1).mean()), 1e-9)
     best, found = -1.0, None
     for elevation in np.radians([15.0, 25.0, 40.0, 60.0]):

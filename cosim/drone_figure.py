@@ -20,6 +20,14 @@ Floats = NDArray[np.float64]
 CAMERA_COLOUR: Final = "#f2b705"
 TARGET_COLOUR: Final = "#12a150"
 MEMORY_COLOUR: Final = "#8e44ad"
+LIDAR_COLOUR: Final = "#2678c8"
+KEY: Final = (
+    ("LiDAR, red near the wall", LIDAR_COLOUR),
+    ("camera's field of view", CAMERA_COLOUR),
+    ("target in view", TARGET_COLOUR),
+    ("remembered direction", MEMORY_COLOUR),
+)
+"""What the colours of a drone's senses mean."""
 
 _NEAR: Final = np.array([214.0, 40.0, 40.0])
 _FAR: Final = np.array([38.0, 120.0, 200.0])
@@ -63,7 +71,7 @@ class DroneFigure:
         self._dot = stage.dot(colour, 10.0)
         rays, border = 2 * sensors.rays, 4 * _SIDES
         nowhere = np.zeros((2, 3))
-        self._rays = stage.lines([nowhere] * rays, "#2678c8", 1.3)
+        self._rays = stage.lines([nowhere] * rays, LIDAR_COLOUR, 1.3)
         around = np.arange(border)
         fan = np.stack([np.zeros_like(around), 1 + around, 1 + (around + 1) % border], axis=1)
         self._fan = stage.surface(

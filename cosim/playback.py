@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.cameras import INSIDE_BACK, Camera, follow, inside, overview
-from cosim.drone_figure import DroneFigure, Sighting
+from cosim.drone_figure import KEY, DroneFigure, Sighting
 from cosim.report_tube import simplify
 from cosim.scene import Surface
 from cosim.senses import local_frames
@@ -68,9 +68,9 @@ class Playback:
             )
             for track, shade in zip(tracks, own, strict=True)
         ]
-        if len(tracks) > 1:
-            stage.legend([(track.name, shade) for track, shade in zip(tracks, own, strict=True)])
-        self._say = stage.text("", "top-left", size=0.95)
+        names = [(track.name, shade) for track, shade in zip(tracks, own, strict=True)]
+        stage.legend([*(names if len(tracks) > 1 else []), ("centreline", AXIS_COLOUR), *KEY])
+        self._say = stage.text("", "top-left", size=0.8)
         self._overview = overview(
             np.concatenate([track.scene.tube.vertices for track in tracks]), stage.size[0] / stage.size[1]
         )
@@ -168,9 +168,9 @@ def _put_up(stage: Stage, tracks: Sequence[Track]) -> dict[int, RayScene]:
             same = RayScene(tube.vertices, tube.faces)
             shown.append((tube, same))
             drawn = simplify(tube, TRIANGLES) if len(tube.faces) > TRIANGLES else tube
-            stage.wall(face_outwards(drawn, track.scene.axis), WALL_COLOUR, cut=True)
+            stage.wall(face_outwards(drawn, track.centreline), WALL_COLOUR, cut=True)
             stage.rims(drawn, RIM_COLOUR)
-            stage.lines([track.scene.axis], AXIS_COLOUR, 2.0)
+            stage.lines([track.centreline], AXIS_COLOUR, 2.0)
         walls[id(tube)] = same
     return walls
 

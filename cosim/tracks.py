@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,8 +16,12 @@ from agent_client.judge import Outcome
 from agent_client.reward import Regime
 from cosim.errors import RunError
 from cosim.runs import Run, column, read_run
-from cosim.scene import Scene, read_scene
+from cosim.scene import Scene, read_scene, where_is
 from cosim.senses import Sensors
+from meshes.centreline import parse_centreline
+from meshes.errors import MeshError
+from meshes.wall import to_world
+from protocol.layout import Axes
 
 Floats = NDArray[np.float64]
 Quantity = Literal["clearance", "reward", "speed"]
@@ -27,7 +32,8 @@ TITLES: Final[dict[str, str]] = {
     "speed": "speed\n(m/s)",
 }
 """Of the scale of a quantity that colours a trajectory. The gap is that between body and wall."""
-MAPS: Final[dict[str, str]] = {"clearance": "RdYlBu", "reward": "RdYlBu", "speed": "viridis"}
+# The colours of the centreline and of the camera's field are in neither scale.
+MAPS: Final[dict[str, str]] = {"clearance": "RdBu", "reward": "RdBu", "speed": "viridis"}
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,10 @@ class Track:
     """For legends; no other track that is shown with it has the same."""
     run: Run
     scene: Scene
+    centreline: Floats  # (M, 3)
+    """Of the whole tube (m); of the part that was flown where there is no more of it."""
+    note: str
+    """What is not as it was flown, for people; empty where all is."""
     sensors: Sensors
     body_radius: float
     """(m)"""
@@ -72,7 +82,7 @@ class Track:
         touched = "   CONTACT" if record["contact"] else ""
         return (
             f"step {k} of {self.last}   {self.scene.times[k]:.1f} s   "
-            f"{100.0 * float(record['progress']):.1f} % of {self.length:.1f} m{self._end(record)}\n"
+            f"{100.0 * float(record['progress']):.1f} % of {self.length:.1f} m{self._end(k)}\n"
             f"{speed:.2f} m/s   gap {self._gap(record):.2f} m   target {self._target(record)}{touched}"
         )
 
@@ -81,7 +91,7 @@ class Track:
         record = self.record(k)
         return (
             f"{self.name}   {self.scene.times[k]:.1f} s   {100.0 * float(record['progress']):.1f} %   "
-            f"gap {self._gap(record):.2f} m{self._end(record)}"
+            f"gap {self._gap(record):.2f} m{self._end(k)}"
         )
 
     def _gap(self, record: Any) -> float:
@@ -90,9 +100,12 @@ class Track:
     def _target(self, record: Any) -> str:
         return _SEEN[Regime(int(record["regime"]))]
 
-    def _end(self, record: Any) -> str:
-        outcome = Outcome(int(record["outcome"]))
-        return "" if outcome is Outcome.RUNNING else f"   {outcome.name}"
+    def _end(self, k: int) -> str:
+        """How the run ends; in capitals where it does."""
+        outcome = Outcome(int(self.record(self.last)["outcome"]))
+        if outcome is Outcome.RUNNING:
+            return "   cut short" if k == self.last else ""
+        return f"   {outcome.name}" if k == self.last else f"   ends in {outcome.name.lower()}"
 
 
 _SEEN: Final = {Regime.VISIBLE: "in view", Regime.MEMORY: "remembered", Regime.BLIND: "lost"}
@@ -113,13 +126,39 @@ def read_tracks(folders: Sequence[Path]) -> tuple[Track, ...]:
     names = [str(run.manifest["policy"]["name"]) for run in runs]
     often = Counter(names)
     return tuple(
-        Track(
-            name=name if often[name] == 1 else f"{name} ({run.folder.name})",
-            run=run,
-            scene=read_scene(run),
-            sensors=Sensors.of_manifest(run.manifest),
-            body_radius=run.manifest["parameters"]["body_radius"],
-            length=run.manifest["mesh"]["length_m"],
-        )
+        _read_track(run, name if often[name] == 1 else f"{name} ({run.folder.name})")
         for name, run in zip(names, runs, strict=True)
     )
+
+
+def _read_track(run: Run, name: str) -> Track:
+    scene = read_scene(run)
+    # A tube that is rebuilt from what was flown has no more of a centreline.
+    centreline, note = (scene.axis, scene.note) if scene.note else _read_centreline(run, scene)
+    return Track(
+        name=name,
+        run=run,
+        scene=scene,
+        centreline=centreline,
+        note=note,
+        sensors=Sensors.of_manifest(run.manifest),
+        body_radius=run.manifest["parameters"]["body_radius"],
+        length=run.manifest["mesh"]["length_m"],
+    )
+
+
+def _read_centreline(run: Run, scene: Scene) -> tuple[Floats, str]:
+    """The centreline from its file, or of the part that was flown and why."""
+    described = run.manifest["mesh"]
+    path = where_is(run, described["centreline"])
+    try:
+        content = path.read_bytes()
+        if hashlib.sha256(content).hexdigest() == described["centreline_sha256"]:
+            points = parse_centreline(content, path)
+            return to_world(points, Axes[described["axes"]].name, described["scale"], path), ""  # type: ignore[arg-type]
+        why = f"{path} is not the centreline of the flight"
+    except OSError as error:
+        why = f"{path} cannot be read ({error.strerror})"
+    except MeshError as error:
+        why = str(error)
+    return scene.axis, f"{why}; the centreline shown is that of the part that was flown"

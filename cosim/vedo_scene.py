@@ -23,10 +23,13 @@ from cosim.cameras import Camera
 from cosim.errors import NoDisplayError, ViewError
 from cosim.film import Image
 from cosim.scene import Surface
+from protocol.signals import held_signals
 
 Floats = NDArray[np.float64]
 FONT: Final = "Calco"
 INK: Final = "#22303c"
+LETTER: Final = 12.6
+"""Width of a letter of `FONT` at size 1 (pixels)."""
 
 _OSMESA: Final = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
 
@@ -180,25 +183,21 @@ class Stage:
         )
         self._plotter.add(labels)
 
-    def legend(self, entries: Sequence[tuple[str, str]]) -> None:
+    def legend(self, entries: Sequence[tuple[str, str]], *, size: float = 0.65) -> None:
         """Name colours at the top right: (name, colour) of each."""
-        longest = max(len(name) for name, _ in entries)
-        swatches = []
-        for name, colour in entries:
-            swatches.append(
-                vedo.Mesh([[(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)]], c=colour).legend(name)
-            )
-        box = vedo.LegendBox(
-            swatches,
-            font=FONT,
-            width=min(0.5, (0.011 * longest + 0.06)),
-            height=0.045 * len(entries),
-            pos="top-right",
-            markers="s",
-            bg="white",
-            alpha=0.6,
-        )
-        self._plotter.add(box)
+        columns = 4 + max(len(name) for name, _ in entries)
+        place = (0.995 - size * self._unit * LETTER * columns / self.size[0], 0.995)
+
+        def write(words: str, colour: str, box: float) -> None:
+            text = vedo.Text2D(
+                words, pos=place, s=size * self._unit, c=colour, font=FONT, bg="white", alpha=box,
+                justify="top-left", bold=box == 0.0,
+            )  # fmt: skip
+            self._plotter.add(text)
+
+        write("\n".join(f"   {name}" for name, _ in entries), INK, 0.55)
+        for row, (_, colour) in enumerate(entries):
+            write("\n" * row + 2 * "\u2014", colour, 0.0)
 
     def look(self, camera: Camera) -> None:
         """Look from there."""
@@ -227,7 +226,8 @@ class Stage:
         """Let the window answer to mouse and keys; whether it is still open."""
         self._begin()
         if not self._closed:
-            self._plotter.interactor.ProcessEvents()
+            with held_signals():  # VTK ends the process at once where Ctrl-C is raised out of a handler
+                self._plotter.interactor.ProcessEvents()
         return not self._closed
 
     def on_key(self, handler: Callable[[str], None]) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from cosim import interrupts
 from cosim.errors import NoDisplayError, ViewError
 from cosim.film import INSTALL, check_outputs, write_film, write_picture
 from cosim.live import counting
@@ -117,8 +118,8 @@ def _view_runs(options: ViewOptions, tracks: tuple[Track, ...]) -> None:
     if options.figure is not None:
         raise ViewError("--figure: expected a mesh, found a run; name the mesh that it was flown in")
     for track in tracks:
-        if track.scene.note:
-            click.echo(f"{track.run.folder}: {track.scene.note}", err=True)
+        if track.note:
+            click.echo(f"{track.run.folder}: {track.note}", err=True)
     stage = open_stage(
         options.size, offscreen=options.offscreen, title=f"cosim view - {tracks[0].run.folder}"
     )
@@ -149,6 +150,7 @@ def _film(path: Path, stage: Stage, playback: Playback, realtime: float) -> None
 
     def frames(advance: Callable[[int], None]) -> Iterator[Image]:
         for k in moments:
+            interrupts.check()
             playback.show(k)
             yield stage.picture()
             advance(1)

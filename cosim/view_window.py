@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final
 
+from cosim import interrupts
 from cosim.playback import VIEWS, Playback
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ class Controls:
     def run(self) -> None:
         """Until the window is closed."""
         while self._stage.pump() and self.open:
+            interrupts.check()
             if self.playing:
                 self.advance(time.monotonic())
             time.sleep(NAP_S)
@@ -119,4 +121,5 @@ def stay_open(stage: Stage) -> None:
     stage.text("drag turn   wheel zoom   q quit", "bottom-left", size=0.6)
     stage.draw()
     while stage.pump() and not set(pressed) & set(QUIT):
+        interrupts.check()
         time.sleep(NAP_S)

@@ -60,6 +60,17 @@ def test_an_overview_of_a_straight_tube_is_from_its_side() -> None:
     assert abs(towards[0]) < 0.3 * np.linalg.norm(towards)
 
 
+@pytest.mark.parametrize("walls", [1, 2])
+def test_an_overview_shows_how_a_tube_is_bent(walls: int) -> None:
+    """A tube bent in an upright plane is not seen edge-on, also where its file has an inner and an outer wall."""
+    x = np.linspace(-1.0, 1.0, 400)
+    wall = 5.0 * np.stack([x, np.zeros(400), 1.5 * x**2], axis=1)
+    around = np.stack([np.zeros(400), np.cos(300.0 * x), np.sin(300.0 * x)], axis=1)
+    camera = overview(np.concatenate([wall + radius * around for radius in (1.0, 1.3)[:walls]]), 1.5)
+    towards = camera.focus - camera.position
+    assert abs(towards[1]) > 0.8 * np.linalg.norm(towards)
+
+
 def test_a_following_camera_sees_the_drone_and_leaves_out_what_stands_before_it() -> None:
     """The drone is near the middle of the picture, and what is nearer than it by 2.5 R is not drawn."""
     position, tangent = np.array([4.0, 1.0, 2.0]), np.array([0.0, 0.6, 0.8])
