@@ -85,7 +85,7 @@ def export(run: Path, kind: str, output: Path | None) -> None:
     """Write a recorded run in another format, from its folder alone.
 
     \b
-    csv, npz, parquet  every number of every step, with units and frames
+    parquet, npz, csv  every number of every step; with units and frames, but for csv
     tum                trajectory for `evo` and SLAM benchmarks
     mcap               poses, scans, commands and state for Foxglove
     gltf, usd          animated scene for Blender, Unity and web viewers

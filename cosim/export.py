@@ -11,6 +11,7 @@ from cosim.errors import OutputError
 from cosim.export_robotics import write_mcap, write_tum
 from cosim.export_scene import write_gltf, write_usd
 from cosim.export_tables import write_csv, write_npz, write_parquet
+from cosim.live import counting
 from cosim.recording import LOG, MANIFEST
 from cosim.runs import Run, read_run
 
@@ -21,8 +22,8 @@ class Format:
 
     suffix: str
     """Of its files where none is named."""
-    write: Callable[[Run, Path], str]
-    """(run, file) -> what is not as it was flown, for people."""
+    write: Callable[[Run, Path, Callable[[float], None]], str]
+    """(run, file, told how many records more were written) -> what is not as it was flown, for people."""
 
 
 FORMATS: Final[dict[str, Format]] = {
@@ -58,7 +59,8 @@ def export(folder: Path, kind: str, output: Path | None = None) -> tuple[Path, s
         raise OutputError(f"{folder}: expected a run with at least its reset pose, found no whole record")
     partial = target.with_name(f"{target.stem}.partial{target.suffix}")
     try:
-        note = form.write(run, partial)
+        with counting(f"writing {target.name}", len(run.records)) as done:
+            note = form.write(run, partial, done)
         partial.replace(target)
     except OSError as error:
         raise OutputError(f"{target} cannot be written: {error.strerror}") from error

@@ -23,6 +23,8 @@ from cosim.errors import CosimError
 from cosim.runs import Run, chunks
 from cosim.scene import read_axis
 
+Done = Callable[[float], None]
+
 WORLD: Final = "world"
 DRONE: Final = "drone"
 TUM_COLUMNS: Final = "timestamp tx ty tz qx qy qz qw"
@@ -32,13 +34,14 @@ _RING_TURN: Final = {"x": 0.5, "y": -0.5, "z": -0.5, "w": 0.5}
 """From a ring's own frame, in which rays turn about z from x, to the body's: x along right, y along up."""
 
 
-def write_tum(run: Run, target: Path) -> str:
+def write_tum(run: Run, target: Path, done: Done) -> str:
     """Write one line a record: simulated time (s), position (m) and quaternion x y z w, body to world."""
     with target.open("w", encoding="utf-8") as file:
         file.write(f"# {TUM_COLUMNS}\n")
         for records in chunks(run):
             rows = np.column_stack([records["sim_time"], records["position"], records["quaternion"]])
             file.writelines(" ".join(map(repr, row)) + "\n" for row in rows.tolist())
+            done(len(records))
     return ""
 
 
@@ -71,7 +74,7 @@ class _Record:
         return {"sec": self.time // 10**9, "nsec": self.time % 10**9}
 
 
-def write_mcap(run: Run, target: Path) -> str:
+def write_mcap(run: Run, target: Path, done: Done) -> str:
     """Write an MCAP file that Foxglove opens: poses, velocity, commands, state, scans and the centreline.
 
     Raises:
@@ -102,6 +105,7 @@ def write_mcap(run: Run, target: Path) -> str:
                 )
                 for channel, message in channels:
                     _add(writer, channel, record.time, message(record))
+            done(len(records))
         writer.finish()
     return ""
 
@@ -150,7 +154,7 @@ def _command(record: _Record) -> dict[str, Any]:
         "speed": values["commanded_speed"],
         "compensation": values["compensation"],
         "action": values["action"],
-        "entropy": _finite(values["entropy"]),
+        **_finite({"entropy": values["entropy"]}),
     }
 
 
@@ -161,7 +165,7 @@ def _state(record: _Record) -> dict[str, Any]:
         "step": values["step"],
         "outcome": Outcome(values["outcome"]).name.lower(),
         "regime": Regime(regime).name.lower() if regime else "none",
-        **{name: _finite(values[name]) for name in STATE},
+        **_finite({name: values[name] for name in STATE}),
         "contact_steps": values["contact_steps"],
     }
 
@@ -203,15 +207,15 @@ def _centreline(run: Run) -> dict[str, Any]:
         "lifetime": {"sec": 0, "nsec": 0},
         "frame_locked": False,
         "metadata": [],
-        **{kind: [] for kind in ("arrows", "cubes", "spheres", "cylinders", "triangles", "texts", "models")},
+        **{kind: [] for kind in _OTHER_SHAPES},
         "lines": [line],
     }
     return {"deletions": [], "entities": [entity]}
 
 
-def _finite(value: float) -> float | None:
-    """JSON has no NaN."""
-    return value if math.isfinite(value) else None
+def _finite(values: dict[str, float]) -> dict[str, float]:
+    """The values without those that are not there: JSON has no NaN."""
+    return {name: value for name, value in values.items() if math.isfinite(value)}
 
 
 def _object(**properties: dict[str, Any]) -> dict[str, Any]:
@@ -221,6 +225,9 @@ def _object(**properties: dict[str, Any]) -> dict[str, Any]:
 def _array(items: dict[str, Any]) -> dict[str, Any]:
     return {"type": "array", "items": items}
 
+
+_OTHER_SHAPES: Final = ("arrows", "cubes", "spheres", "cylinders", "triangles", "texts", "models")
+"""Of an entity of a Foxglove scene, beside lines."""
 
 STATE: Final = (
     "progress",
@@ -236,6 +243,7 @@ STATE: Final = (
 _NUMBER: Final = {"type": "number"}
 _WHOLE: Final = {"type": "integer"}
 _TEXT: Final = {"type": "string"}
+_TRUTH: Final = {"type": "boolean"}
 _TIME: Final = _object(sec=_WHOLE, nsec=_WHOLE)
 _VECTOR: Final = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
 _QUATERNION: Final = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
@@ -288,10 +296,33 @@ TOPICS: Final = (
         for i, (name, _) in enumerate(_RINGS)
     ),
 )
+_COLOUR: Final = _object(r=_NUMBER, g=_NUMBER, b=_NUMBER, a=_NUMBER)
+_LINE: Final = _object(
+    type=_WHOLE,
+    pose=_POSE,
+    thickness=_NUMBER,
+    scale_invariant=_TRUTH,
+    points=_array(_VECTOR),
+    color=_COLOUR,
+    colors=_array(_COLOUR),
+    indices=_array(_WHOLE),
+)
+_ENTITY: Final = _object(
+    **_STAMPED,
+    id=_TEXT,
+    lifetime=_TIME,
+    frame_locked=_TRUTH,
+    metadata=_array(_object(key=_TEXT, value=_TEXT)),
+    lines=_array(_LINE),
+    **dict.fromkeys(_OTHER_SHAPES, _array(_object())),
+)
 TUBE: Final = Topic(
     "/tube",
     "foxglove.SceneUpdate",
-    _object(deletions=_array(_object()), entities=_array(_object())),
+    _object(
+        deletions=_array(_object(timestamp=_TIME, type=_WHOLE, id=_TEXT)),
+        entities=_array(_ENTITY),
+    ),
     lambda _: {},
 )
 """Written once, at the beginning."""

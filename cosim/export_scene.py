@@ -6,6 +6,10 @@ simulated time.
 
 from __future__ import annotations
 
+import json
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,8 +18,12 @@ from numpy.typing import NDArray
 
 from cosim import __version__
 from cosim.errors import CosimError, OutputError
-from cosim.runs import Run
-from cosim.scene import Scene, read_scene
+from cosim.runs import Run, chunks
+from cosim.scene import Surface, drone_surface, read_surroundings
+
+Floats = NDArray[np.float64]
+Colour = tuple[float, float, float, float]
+Done = Callable[[float], None]
 
 TUBE_COLOUR: Final = (0.55, 0.62, 0.70, 0.30)
 AXIS_COLOUR: Final = (0.95, 0.75, 0.20, 1.0)
@@ -23,182 +31,305 @@ PATH_COLOUR: Final = (0.16, 0.47, 0.84, 1.0)
 DRONE_COLOUR: Final = (0.86, 0.22, 0.18, 1.0)
 
 USD_SUFFIXES: Final = (".usd", ".usda", ".usdc")
+USD_RATE: Final = 24.0
+"""Time codes a second: Blender takes one for a frame, and its scenes have 24 a second."""
+MOST_POSES: Final = 200_000
+"""Of an animation in USD, whose library holds all of it in memory, about half a kilobyte each."""
 
 _Z_UP_TO_Y_UP: Final = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
 """Turn by -90 degrees about x, x y z w: glTF's world has Y up."""
 
 
-def write_gltf(run: Run, target: Path) -> str:
+@dataclass(frozen=True)
+class _Poses:
+    """Some of the drone's poses, in order."""
+
+    times: Floats  # (T,)
+    """Simulated time (s)."""
+    positions: Floats  # (T, 3)
+    quaternions: Floats  # (T, 4)
+    """x y z w, body to world; their signs do not jump, so that what lies between two of them is the short way."""
+
+
+def _poses(run: Run, stride: int = 1) -> Iterator[_Poses]:
+    """Every stride-th pose of a run and the last one, some thousands at a time."""
+    first, last = 0, len(run.records) - 1
+    before: Floats = np.zeros((1, 4))
+    for records in chunks(run):
+        number = np.arange(first, first + len(records))
+        first += len(records)
+        taken = records[(number % stride == 0) | (number == last)]
+        if not len(taken):
+            continue
+        turns = np.concatenate([before, taken["quaternion"]])
+        signs = np.where(np.einsum("ij,ij->i", turns[1:], turns[:-1]) < 0.0, -1.0, 1.0)
+        quaternions: Floats = turns[1:] * np.cumprod(signs).astype(np.float64)[:, None]
+        before = quaternions[-1:]
+        yield _Poses(taken["sim_time"].copy(), taken["position"].copy(), quaternions)
+
+
+def write_gltf(run: Run, target: Path, done: Done) -> str:
     """Write a binary glTF 2.0 file; returns what is not as it was flown.
 
-    Raises:
-        CosimError: pygltflib is not installed.
+    The poses are written as the log is read: a flight of any length fits in memory.
     """
-    try:
-        import pygltflib as gltf  # writes and checks the structure of the file
-    except ImportError as error:
-        raise CosimError("glTF needs pygltflib; install it with: pip install 'tube-cosim[export]'") from error
-    scene = read_scene(run)
-    build = _Gltf(gltf)
-    colours = (TUBE_COLOUR, AXIS_COLOUR, PATH_COLOUR, DRONE_COLOUR)
-    materials = [build.material(colour) for colour in colours]
-    children = [
-        build.mesh("tube", scene.tube.vertices, scene.tube.faces, materials[0]),
-        build.line("centreline", scene.axis, materials[1]),
-        build.line("trajectory", scene.positions, materials[2]),
-        build.mesh("drone", scene.drone.vertices, scene.drone.faces, materials[3]),
-    ]
-    build.animate(children[-1], scene)
-    build.finish(children, target)
-    return scene.note
+    tube, axis, note = read_surroundings(run)
+    drone = drone_surface(run.manifest["parameters"]["body_radius"])
+    document = _Gltf()
+    document.mesh("tube", tube, TUBE_COLOUR)
+    document.line("centreline", document.points(axis), AXIS_COLOUR)
+    count = len(run.records)
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for poses in _poses(run):
+        low = np.minimum(low, poses.positions.min(axis=0))
+        high = np.maximum(high, poses.positions.max(axis=0))
+    ends = [float(run.records["sim_time"][i]) for i in (0, -1)]
+    path = document.room(count, "VEC3", (low.tolist(), high.tolist()), ARRAY_BUFFER)
+    document.line("trajectory", path, PATH_COLOUR)
+    times = document.room(count, "SCALAR", ([ends[0]], [ends[1]]))
+    places, turns = document.room(count, "VEC3"), document.room(count, "VEC4")
+    document.animate(document.mesh("drone", drone, DRONE_COLOUR), times, places, turns)
+    with target.open("wb") as file:
+        document.write(file)
+        for poses in _poses(run):
+            document.fill(file, path, poses.positions)
+            document.fill(file, times, poses.times)
+            document.fill(file, places, poses.positions)
+            document.fill(file, turns, poses.quaternions)
+            done(len(poses.times))
+    return note
+
+
+ARRAY_BUFFER: Final = 34962
+ELEMENT_ARRAY_BUFFER: Final = 34963
+_FLOAT: Final = 5126
+_UNSIGNED_INT: Final = 5125
+_LINE_STRIP: Final = 3
+_TRIANGLES: Final = 4
+_WIDTHS: Final = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
 class _Gltf:
-    """A glTF document under construction, and the one buffer behind it."""
+    """A glTF document under construction, with one buffer, of which parts are written after the document."""
 
-    def __init__(self, gltf: Any) -> None:
-        self._gltf = gltf
-        self._document = gltf.GLTF2(asset=gltf.Asset(generator=f"tube-cosim {__version__}"))
-        self._pieces: list[bytes] = []
+    def __init__(self) -> None:
+        self._nodes: list[dict[str, Any]] = []
+        self._meshes: list[dict[str, Any]] = []
+        self._materials: list[dict[str, Any]] = []
+        self._accessors: list[dict[str, Any]] = []
+        self._views: list[dict[str, Any]] = []
+        self._animations: list[dict[str, Any]] = []
+        self._known: list[tuple[int, NDArray[Any]]] = []
+        """Accessors whose values are there already."""
+        self._filled: dict[int, int] = {}
+        """Bytes that were written of an accessor."""
         self._size = 0
+        self._start = 0
+        """Of the buffer in the file."""
 
-    def material(self, colour: tuple[float, float, float, float]) -> int:
-        gltf = self._gltf
-        surface = gltf.PbrMetallicRoughness(
-            baseColorFactor=list(colour), metallicFactor=0.0, roughnessFactor=0.9
+    def mesh(self, name: str, surface: Surface, colour: Colour) -> int:
+        """Add triangles; returns their node."""
+        indices = self.room(
+            surface.faces.size, "SCALAR", target=ELEMENT_ARRAY_BUFFER, component=_UNSIGNED_INT
         )
-        mode = gltf.OPAQUE if colour[3] == 1.0 else gltf.BLEND
-        self._document.materials.append(
-            gltf.Material(pbrMetallicRoughness=surface, alphaMode=mode, alphaCutoff=None, doubleSided=True)
+        self._known.append((indices, surface.faces.ravel().astype("<u4")))
+        return self._node(
+            name, self.points(surface.vertices), colour, {"mode": _TRIANGLES, "indices": indices}
         )
-        return len(self._document.materials) - 1
 
-    def mesh(self, name: str, vertices: NDArray[Any], faces: NDArray[Any], material: int) -> int:
-        indices = self._accessor(faces.ravel().astype("<u4"), "SCALAR", self._gltf.ELEMENT_ARRAY_BUFFER)
-        return self._node(name, vertices, material, self._gltf.TRIANGLES, indices)
+    def line(self, name: str, points: int, colour: Colour) -> None:
+        """Add a line through the points of an accessor."""
+        self._node(name, points, colour, {"mode": _LINE_STRIP})
 
-    def line(self, name: str, points: NDArray[Any], material: int) -> int:
-        return self._node(name, points, material, self._gltf.LINE_STRIP, None)
+    def points(self, points: Floats) -> int:
+        """Add places (N, 3); returns their accessor."""
+        values = points.astype("<f4")
+        limits = (values.min(axis=0).tolist(), values.max(axis=0).tolist())
+        accessor = self.room(len(values), "VEC3", limits, ARRAY_BUFFER)
+        self._known.append((accessor, values))
+        return accessor
 
-    def animate(self, node: int, scene: Scene) -> None:
-        gltf = self._gltf
-        times = self._accessor(scene.times.astype("<f4"), "SCALAR", None)
-        samplers, channels = [], []
-        for path, values, kind in (
-            ("translation", scene.positions, "VEC3"),
-            ("rotation", _continuous(scene.quaternions), "VEC4"),
-        ):
-            output = self._accessor(values.astype("<f4"), kind, None)
-            samplers.append(gltf.AnimationSampler(input=times, output=output, interpolation="LINEAR"))
-            where = gltf.AnimationChannelTarget(node=node, path=path)
-            channels.append(gltf.AnimationChannel(sampler=len(samplers) - 1, target=where))
-        self._document.animations.append(gltf.Animation(name="flight", samplers=samplers, channels=channels))
-
-    def finish(self, children: list[int], target: Path) -> None:
-        gltf, document = self._gltf, self._document
-        document.nodes.append(gltf.Node(name="world", rotation=_Z_UP_TO_Y_UP, children=children))
-        document.scenes.append(gltf.Scene(nodes=[len(document.nodes) - 1]))
-        document.scene = 0
-        document.buffers.append(gltf.Buffer(byteLength=self._size))
-        document.set_binary_blob(b"".join(self._pieces))
-        document.save_binary(str(target))
-
-    def _node(self, name: str, points: NDArray[Any], material: int, mode: int, indices: int | None) -> int:
-        gltf = self._gltf
-        place = self._accessor(points.astype("<f4"), "VEC3", gltf.ARRAY_BUFFER)
-        attributes = gltf.Attributes(POSITION=place)
-        part = gltf.Primitive(attributes=attributes, indices=indices, material=material, mode=mode)
-        self._document.meshes.append(gltf.Mesh(name=name, primitives=[part]))
-        self._document.nodes.append(gltf.Node(name=name, mesh=len(self._document.meshes) - 1))
-        return len(self._document.nodes) - 1
-
-    def _accessor(self, values: NDArray[Any], kind: str, target: int | None) -> int:
-        gltf = self._gltf
-        document, raw = self._document, values.tobytes()
-        document.bufferViews.append(
-            gltf.BufferView(buffer=0, byteOffset=self._size, byteLength=len(raw), target=target)
+    def room(
+        self,
+        count: int,
+        kind: str,
+        limits: tuple[list[float], list[float]] | None = None,
+        target: int | None = None,
+        component: int = _FLOAT,
+    ) -> int:
+        """Make room for values that `fill` writes; returns their accessor."""
+        size = 4 * count * _WIDTHS[kind]  # of 4-byte items: everything stays aligned
+        view = {"buffer": 0, "byteOffset": self._size, "byteLength": size}
+        self._views.append(view if target is None else view | {"target": target})
+        accessor = {
+            "bufferView": len(self._views) - 1,
+            "componentType": component,
+            "count": count,
+            "type": kind,
+        }
+        self._accessors.append(
+            accessor if limits is None else accessor | {"min": limits[0], "max": limits[1]}
         )
-        component = gltf.UNSIGNED_INT if values.dtype.kind == "u" else gltf.FLOAT
-        flat = values.reshape(len(values), -1)
-        document.accessors.append(
-            gltf.Accessor(
-                bufferView=len(document.bufferViews) - 1,
-                componentType=component,
-                count=len(values),
-                type=kind,
-                min=flat.min(axis=0).tolist(),
-                max=flat.max(axis=0).tolist(),
-            )
+        self._size += size
+        return len(self._accessors) - 1
+
+    def animate(self, node: int, times: int, places: int, turns: int) -> None:
+        """Let a node move by the values of three accessors."""
+        outputs = (("translation", places), ("rotation", turns))
+        self._animations.append(
+            {
+                "name": "flight",
+                "samplers": [{"input": times, "output": o, "interpolation": "LINEAR"} for _, o in outputs],
+                "channels": [
+                    {"sampler": i, "target": {"node": node, "path": path}}
+                    for i, (path, _) in enumerate(outputs)
+                ],
+            }
         )
-        self._pieces.append(raw)  # of 4-byte items: every piece stays aligned
-        self._size += len(raw)
-        return len(document.accessors) - 1
+
+    def write(self, file: Any) -> None:
+        """Write the document, and of the buffer what is there already."""
+        world = {"name": "world", "rotation": _Z_UP_TO_Y_UP, "children": list(range(len(self._nodes)))}
+        text = json.dumps(
+            {
+                "asset": {"version": "2.0", "generator": f"tube-cosim {__version__}"},
+                "scene": 0,
+                "scenes": [{"nodes": [len(self._nodes)]}],
+                "nodes": [*self._nodes, world],
+                "meshes": self._meshes,
+                "materials": self._materials,
+                "accessors": self._accessors,
+                "bufferViews": self._views,
+                "buffers": [{"byteLength": self._size}],
+                "animations": self._animations,
+            },
+            allow_nan=False,
+        ).encode()
+        text += b" " * (-len(text) % 4)
+        self._start = 12 + 8 + len(text) + 8
+        file.write(struct.pack("<4sII", b"glTF", 2, self._start + self._size))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", self._size, b"BIN\0"))
+        for accessor, values in self._known:
+            self.fill(file, accessor, values)
+
+    def fill(self, file: Any, accessor: int, values: NDArray[Any]) -> None:
+        """Write the next values of an accessor."""
+        raw = values.astype("<f4" if values.dtype.kind == "f" else "<u4").tobytes()
+        filled = self._filled.get(accessor, 0)
+        file.seek(self._start + int(self._views[accessor]["byteOffset"]) + filled)
+        file.write(raw)
+        self._filled[accessor] = filled + len(raw)
+
+    def _node(self, name: str, points: int, colour: Colour, rest: dict[str, Any]) -> int:
+        surface = {"baseColorFactor": list(colour), "metallicFactor": 0.0, "roughnessFactor": 0.9}
+        material = {"name": name, "pbrMetallicRoughness": surface, "doubleSided": True}
+        self._materials.append(material if colour[3] == 1.0 else material | {"alphaMode": "BLEND"})
+        part = {"attributes": {"POSITION": points}, "material": len(self._materials) - 1} | rest
+        self._meshes.append({"name": name, "primitives": [part]})
+        self._nodes.append({"name": name, "mesh": len(self._meshes) - 1})
+        return len(self._nodes) - 1
 
 
-def write_usd(run: Run, target: Path) -> str:
-    """Write a USD stage with one time code a control step; returns what is not as it was flown.
+def write_usd(run: Run, target: Path, done: Done) -> str:
+    """Write a USD stage of 24 time codes a second; returns what is not as it was flown.
 
     Raises:
         CosimError: usd-core is not installed.
-        OutputError: the file's name does not say which kind of USD is meant.
+        OutputError: the file's name does not say which kind of USD is meant, or it cannot be written.
     """
     if target.suffix not in USD_SUFFIXES:
         raise OutputError(f"{target.name}: expected a name that ends in {' or '.join(USD_SUFFIXES)}")
     try:
-        from pxr import Gf, Usd, UsdGeom, Vt  # Pixar's own library: no other writes the binary format
+        from pxr import Tf, Usd, UsdGeom  # Pixar's own library: no other writes the binary format
     except ImportError as error:
         raise CosimError("USD needs usd-core; install it with: pip install 'tube-cosim[export]'") from error
-    scene = read_scene(run)
+    tube, axis, note = read_surroundings(run)
+    count = len(run.records)
+    stride = -(-count // MOST_POSES)
+    if stride > 1:
+        note += f"{'; ' if note else ''}every {stride}th of {count} poses (glTF and the tables hold all)"
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    rate = 1.0 / run.manifest["session"]["dt"]
-    stage.SetTimeCodesPerSecond(rate)
-    stage.SetFramesPerSecond(rate)
-    stage.SetStartTimeCode(0)
-    stage.SetEndTimeCode(len(scene.times) - 1)
+    stage.SetTimeCodesPerSecond(USD_RATE)
+    stage.SetFramesPerSecond(USD_RATE)
+    stage.SetStartTimeCode(USD_RATE * float(run.records["sim_time"][0]))
+    stage.SetEndTimeCode(USD_RATE * float(run.records["sim_time"][-1]))
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/World").GetPrim())
+    _usd_mesh(stage, "Tube", tube, TUBE_COLOUR)
+    _usd_line(stage, "Centreline", axis, AXIS_COLOUR)
+    body_radius = run.manifest["parameters"]["body_radius"]
+    drone = _usd_mesh(stage, "Drone", drone_surface(body_radius), DRONE_COLOUR)
+    path = _usd_animate(drone, run, stride, done)
+    _usd_line(stage, "Trajectory", path, PATH_COLOUR)
+    try:
+        stage.GetRootLayer().Export(str(target))
+    except Tf.ErrorException as error:
+        why = str(error).rsplit(" : ", 1)[-1].strip().strip("'")
+        raise OutputError(f"{target.name} cannot be written: {why}") from error
+    return note
 
-    def vectors(points: NDArray[Any]) -> Any:
-        return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, np.float32))
 
-    def mesh(path: str, surface: Any, colour: tuple[float, float, float, float]) -> Any:
-        shape = UsdGeom.Mesh.Define(stage, path)
-        shape.CreatePointsAttr(vectors(surface.vertices))
-        shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(surface.faces), 3, np.int32)))
-        shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(surface.faces.ravel().astype(np.int32)))
-        shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        shape.CreateDoubleSidedAttr(True)
-        shape.CreateDisplayColorAttr([Gf.Vec3f(*colour[:3])])
-        shape.CreateDisplayOpacityAttr([colour[3]])
-        return shape
+def _usd_mesh(stage: Any, name: str, surface: Surface, colour: Colour) -> Any:
+    from pxr import UsdGeom, Vt
 
-    def line(path: str, points: NDArray[Any], colour: tuple[float, float, float, float]) -> None:
-        curve = UsdGeom.BasisCurves.Define(stage, path)
-        curve.CreateTypeAttr(UsdGeom.Tokens.linear)
-        curve.CreatePointsAttr(vectors(points))
-        curve.CreateCurveVertexCountsAttr([len(points)])
-        curve.CreateWidthsAttr([0.02])
-        curve.SetWidthsInterpolation(UsdGeom.Tokens.constant)
-        curve.CreateDisplayColorAttr([Gf.Vec3f(*colour[:3])])
+    shape = UsdGeom.Mesh.Define(stage, f"/World/{name}")
+    shape.CreatePointsAttr(_usd_vectors(surface.vertices))
+    shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(surface.faces), 3, np.int32)))
+    shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(surface.faces.ravel().astype(np.int32)))
+    shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    shape.CreateDoubleSidedAttr(True)
+    _usd_colour(stage, shape, name, colour)
+    return shape
 
-    mesh("/World/Tube", scene.tube, TUBE_COLOUR)
-    line("/World/Centreline", scene.axis, AXIS_COLOUR)
-    line("/World/Trajectory", scene.positions, PATH_COLOUR)
-    drone = mesh("/World/Drone", scene.drone, DRONE_COLOUR)
+
+def _usd_line(stage: Any, name: str, points: Floats, colour: Colour) -> None:
+    from pxr import UsdGeom
+
+    curve = UsdGeom.BasisCurves.Define(stage, f"/World/{name}")
+    curve.CreateTypeAttr(UsdGeom.Tokens.linear)
+    curve.CreatePointsAttr(_usd_vectors(points))
+    curve.CreateCurveVertexCountsAttr([len(points)])
+    curve.CreateWidthsAttr([0.02])
+    curve.SetWidthsInterpolation(UsdGeom.Tokens.constant)
+    _usd_colour(stage, curve, name, colour)
+
+
+def _usd_vectors(points: Floats) -> Any:
+    from pxr import Vt
+
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, np.float32))
+
+
+def _usd_colour(stage: Any, shape: Any, name: str, colour: Colour) -> None:
+    """Give a shape its colour twice: viewers show the display colour, Blender and Unity the material."""
+    from pxr import Gf, Sdf, UsdShade
+
+    shape.CreateDisplayColorAttr([Gf.Vec3f(*colour[:3])])
+    shape.CreateDisplayOpacityAttr([colour[3]])
+    material = UsdShade.Material.Define(stage, f"/World/Materials/{name}")
+    shader = UsdShade.Shader.Define(stage, f"/World/Materials/{name}/Surface")
+    shader.CreateIdAttr("UsdPreviewSurface")
+    shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*colour[:3]))
+    shader.CreateInput("opacity", Sdf.ValueTypeNames.Float).Set(colour[3])
+    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.9)
+    material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+    UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(material)
+
+
+def _usd_animate(drone: Any, run: Run, stride: int, done: Done) -> Floats:
+    """Let the drone move by every stride-th pose; returns their positions (T, 3)."""
+    from pxr import Gf, UsdGeom
+
     double = UsdGeom.XformOp.PrecisionDouble
     place, turn = drone.AddTranslateOp(double), drone.AddOrientOp(double)
-    for step, (position, (x, y, z, w)) in enumerate(
-        zip(scene.positions.tolist(), _continuous(scene.quaternions).tolist(), strict=True)
-    ):
-        place.Set(Gf.Vec3d(*position), step)
-        turn.Set(Gf.Quatd(w, x, y, z), step)
-    stage.GetRootLayer().Export(str(target))
-    return scene.note
-
-
-def _continuous(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same rotations with signs that do not jump, so that what lies between two of them is the short way."""
-    signs = np.ones(len(quaternions))
-    signs[1:] = np.where(np.einsum("ij,ij->i", quaternions[1:], quaternions[:-1]) < 0.0, -1.0, 1.0)
-    return quaternions * np.cumprod(signs)[:, None]
+    path = []
+    for poses in _poses(run, stride):
+        path.append(poses.positions)
+        codes = (USD_RATE * poses.times).tolist()
+        rows = zip(codes, poses.positions.tolist(), poses.quaternions.tolist(), strict=True)
+        for code, position, (x, y, z, w) in rows:
+            place.Set(Gf.Vec3d(*position), code)
+            turn.Set(Gf.Quatd(w, x, y, z), code)
+        done(stride * len(codes))
+    return np.concatenate(path)

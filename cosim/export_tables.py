@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,15 @@ from cosim.errors import CosimError
 from cosim.recording import Column
 from cosim.runs import Run, chunks, element_names
 
+Done = Callable[[float], None]
+
 
 def _scalars(records: NDArray[np.void], column: Column) -> list[NDArray[Any]]:
     values = records[column.name].reshape(len(records), -1)
     return [values[:, i] for i in range(values.shape[1])]
 
 
-def write_csv(run: Run, target: Path) -> str:
+def write_csv(run: Run, target: Path, done: Done) -> str:
     """Write one row a record, with every number exact; nothing is lost."""
     with target.open("w", newline="") as file:
         writer = csv.writer(file)
@@ -29,10 +32,11 @@ def write_csv(run: Run, target: Path) -> str:
         for records in chunks(run):
             columns = [scalar.tolist() for c in run.columns for scalar in _scalars(records, c)]
             writer.writerows(zip(*columns, strict=True))
+            done(len(records))
     return ""
 
 
-def write_npz(run: Run, target: Path) -> str:
+def write_npz(run: Run, target: Path, done: Done) -> str:
     """Write a NumPy archive: an array a field, and the manifest as text."""
     with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
         with archive.open("manifest.npy", "w") as member:
@@ -48,10 +52,11 @@ def write_npz(run: Run, target: Path) -> str:
                 np.lib.format.write_array_header_2_0(member, header)
                 for records in chunks(run):
                     member.write(np.ascontiguousarray(records[column.name]).tobytes())
+                    done(len(records) / len(run.columns))
     return ""
 
 
-def write_parquet(run: Run, target: Path) -> str:
+def write_parquet(run: Run, target: Path, done: Done) -> str:
     """Write Parquet with unit and frame of every column and the manifest in its metadata.
 
     Raises:
@@ -64,16 +69,19 @@ def write_parquet(run: Run, target: Path) -> str:
         raise CosimError(
             "Parquet needs pyarrow; install it with: pip install 'tube-cosim[export]'"
         ) from error
+    described = {name: {"unit": c.unit, "frame": c.frame} for c in run.columns for name in element_names(c)}
     schema = pa.schema(
         [
-            pa.field(name, pa.from_numpy_dtype(np.dtype(c.type)), metadata={"unit": c.unit, "frame": c.frame})
+            pa.field(name, pa.from_numpy_dtype(np.dtype(c.type)), metadata=described[name])
             for c in run.columns
             for name in element_names(c)
         ],
-        metadata={"cosim.manifest": json.dumps(run.manifest)},
+        # Of the file and not of a column alone: Polars and DuckDB show no other.
+        metadata={"cosim.manifest": json.dumps(run.manifest), "cosim.columns": json.dumps(described)},
     )
     with pq.ParquetWriter(target, schema, compression="zstd") as writer:
         for records in chunks(run):
             arrays = [np.ascontiguousarray(s) for c in run.columns for s in _scalars(records, c)]
             writer.write_table(pa.table(arrays, schema=schema))
+            done(len(records))
     return ""

@@ -62,7 +62,7 @@ class LiveLine:
 
 
 @contextmanager
-def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
+def counting(what: str, total: int) -> Iterator[Callable[[float], None]]:
     """A bar on a terminal that fills as it is told how much more was done; silent where stderr is none.
 
     Args:

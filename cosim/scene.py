@@ -13,12 +13,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.runs import Run, column
+from cosim.pilots import SHIPPED_CHECKPOINT
+from cosim.runs import Run, chunks, column
 from meshes.errors import MeshError
 from meshes.sweep import sweep_wall
 from meshes.swept import SweptTube, minimal_frame
+from meshes.tube import INDUSTRIAL
 from meshes.wall import read_wall
 from protocol.layout import Axes
+
+SHIPPED: Final = (INDUSTRIAL, INDUSTRIAL.with_name(f"{INDUSTRIAL.stem}_centerline.obj"), SHIPPED_CHECKPOINT)
+"""Files that every installation has."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -27,6 +32,8 @@ REBUILT_SIDES: Final = 32
 """Sides of a tube that is rebuilt from the log."""
 REBUILT_STEP: Final = 0.25
 """Shortest distance of its rings, over R."""
+MOST_POINTS: Final = 20_000
+"""Of the axis that is read from a log; of a longer one every other is kept, as often as it takes."""
 
 
 @dataclass(frozen=True)
@@ -56,18 +63,8 @@ class Scene:
 
 
 def read_scene(run: Run) -> Scene:
-    """The scene of a run, from its folder and the mesh that it names.
-
-    Where the mesh is gone or another, the tube is rebuilt from the axis and the mean radius that the log holds of
-    the part that was flown, and the note says so.
-    """
-    axis, radius, tangent = read_axis(run)
-    tube, note = _tube(run)
-    if tube is None:
-        tube = _rebuild(axis, tangent, radius)
-        note += (
-            "; the tube shown is rebuilt from the recorded axis and mean radius of the part that was flown"
-        )
+    """The scene of a run, from its folder and the mesh that it names; see `read_surroundings`."""
+    tube, axis, note = read_surroundings(run)
     return Scene(
         tube=tube,
         axis=axis,
@@ -79,10 +76,34 @@ def read_scene(run: Run) -> Scene:
     )
 
 
+def read_surroundings(run: Run) -> tuple[Surface, Floats, str]:
+    """The tube of a run, its axis (M, 3), and what is not as it was flown; a log of any length fits in memory.
+
+    Where the mesh is gone or another, the tube is rebuilt from the axis and the mean radius that the log holds of
+    the part that was flown, and the note says so.
+    """
+    axis, radius, tangent = read_axis(run)
+    tube, note = _tube(run)
+    if tube is None:
+        tube = _rebuild(axis, tangent, radius)
+        note += (
+            "; the tube shown is rebuilt from the recorded axis and mean radius of the part that was flown"
+        )
+    return tube, axis, note
+
+
 def where_is(run: Run, recorded: str) -> Path:
-    """Where a file of the run is: in the run folder if it went with it, else where it was."""
-    beside = run.folder / Path(recorded).name
-    return beside if beside.is_file() else Path(recorded)
+    """Where a file of the run is: in the run folder if it went with it, else where it was.
+
+    A shipped file of another installation is the one of this installation; whether it is the same its hash tells.
+    """
+    there = Path(recorded)
+    beside = run.folder / there.name
+    if beside.is_file():
+        return beside
+    if not there.is_file():
+        return next((path for path in SHIPPED if path.name == there.name), there)
+    return there
 
 
 def drone_surface(body_radius: float, rings: int = 8, sides: int = 16) -> Surface:
@@ -117,13 +138,27 @@ def drone_surface(body_radius: float, rings: int = 8, sides: int = 16) -> Surfac
 
 def read_axis(run: Run) -> tuple[Floats, Floats, Floats]:
     """Axis points (M, 3), mean radii (M,) and tangents (M, 3) where the drone came along, in order of arc length."""
-    along, radius = column(run, "arc_length"), column(run, "radius")
+    names = ("arc_length", "radius", "axis_position", "tangent")
+    kept = {name: np.empty((0, *run.records.dtype[name].shape)) for name in names}
+    for records in chunks(run):
+        seen = {name: np.concatenate([kept[name], records[name]]) for name in names}
+        apart = _apart(seen["arc_length"], seen["radius"])
+        while len(apart) > MOST_POINTS:
+            apart = apart[::2]
+        kept = {name: values[apart] for name, values in seen.items()}
+    return kept["axis_position"], kept["radius"], kept["tangent"]
+
+
+def _apart(along: Floats, radius: Floats) -> list[int]:
+    """Which of the places stand a part of R apart along the axis, in order of arc length."""
     order = np.argsort(along, kind="stable")
-    kept = [int(order[0])]
-    for i in order.tolist()[1:]:
-        if along[i] - along[kept[-1]] >= REBUILT_STEP * max(float(radius[i]), 1e-9):
+    kept, last = [], -np.inf
+    steps = REBUILT_STEP * np.maximum(radius[order], 1e-9)
+    for i, place, step in zip(order.tolist(), along[order].tolist(), steps.tolist(), strict=True):
+        if place - last >= step:
             kept.append(i)
-    return column(run, "axis_position")[kept], radius[kept], column(run, "tangent")[kept]
+            last = place
+    return kept
 
 
 def _tube(run: Run) -> tuple[Surface | None, str]:
@@ -134,6 +169,8 @@ def _tube(run: Run) -> tuple[Surface | None, str]:
         if hashlib.sha256(path.read_bytes()).hexdigest() != described["sha256"]:
             return None, f"{path} is not the mesh that was flown"
         wall = read_wall(path, Axes[described["axes"]].name, described["scale"])  # type: ignore[arg-type]
+        if dict(wall.companions) != described.get("companions", {}):
+            return None, f"a file that {path} names is not the one that was flown"
     except OSError as error:
         return None, f"{path} cannot be read ({error.strerror})"
     except MeshError as error:

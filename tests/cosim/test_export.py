@@ -69,6 +69,8 @@ def test_parquet_is_read_back_by_pyarrow_with_units(run: Run, tmp_path: Path) ->
     assert table["position_x"].to_pylist() == run.records["position"][:, 0].tolist()
     assert table.schema.field("position_x").metadata == {b"unit": b"m", b"frame": b"world"}
     assert json.loads(table.schema.metadata[b"cosim.manifest"])["format"] == 2
+    described = json.loads(table.schema.metadata[b"cosim.columns"])
+    assert described["angular_velocity_z"] == {"unit": "rad/s", "frame": "world"}
 
 
 def test_an_export_never_replaces_the_run_itself(run: Run) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from flights import DEADLINE, Done, environment
 
+from cosim import export_scene
 from cosim.export import export
 from cosim.recording import manifest_digest
 from cosim.runs import Run, read_run
@@ -66,7 +67,7 @@ def test_mcap_holds_poses_commands_scans_and_schemas(run: Run, tmp_path: Path) -
         for schema, channel, message in reader_of(file).iter_messages():
             messages.setdefault(channel.topic, []).append((message.log_time, json.loads(message.data)))
             schemas[channel.topic] = schema.name
-            assert json.loads(schema.data)["type"] == "object"
+            assert_fits(json.loads(message.data), json.loads(schema.data))
     assert schemas["/tf"] == "foxglove.FrameTransform"
     assert schemas["/drone/pose"] == "foxglove.PoseInFrame"
     assert schemas["/drone/lidar/front"] == schemas["/drone/lidar/rear"] == "foxglove.LaserScan"
@@ -78,6 +79,26 @@ def test_mcap_holds_poses_commands_scans_and_schemas(run: Run, tmp_path: Path) -
     assert list(pose["pose"]["position"].values()) == run.records["position"][100].tolist()
     assert messages["/drone/command"][100][1]["speed"] == run.records["commanded_speed"][100]
     assert messages["/drone/state"][-1][1]["outcome"] == "success"
+
+
+def assert_fits(value: Any, schema: dict[str, Any]) -> None:
+    """Hold a message against its JSON schema: the types, and nothing that the schema does not describe."""
+    kinds = {
+        "object": dict,
+        "array": list,
+        "number": (int, float),
+        "integer": int,
+        "string": str,
+        "boolean": bool,
+    }
+    assert isinstance(value, kinds[schema["type"]]), (value, schema)
+    if schema["type"] == "object":
+        assert set(value) <= set(schema["properties"])
+        for name, inner in value.items():
+            assert_fits(inner, schema["properties"][name])
+    elif schema["type"] == "array":
+        for inner in value:
+            assert_fits(inner, schema["items"])
 
 
 def test_a_scan_in_mcap_meets_the_wall_where_the_lidar_did(run: Run, tmp_path: Path) -> None:
@@ -143,21 +164,42 @@ def test_the_gltf_animation_is_the_recorded_flight(run: Run, tmp_path: Path) -> 
 
 
 def test_pixars_library_reads_the_usd_stage(run: Run, tmp_path: Path) -> None:
-    """Z up, metres, one time code a step, and the drone at its recorded pose at each."""
+    """Z up, metres, 24 time codes a second, the drone at its recorded pose at each step; the tube lets one see in."""
     usd = pytest.importorskip("pxr.Usd")
     geometry = pytest.importorskip("pxr.UsdGeom")
+    shade = pytest.importorskip("pxr.UsdShade")
     path, _ = export(run.folder, "usd", tmp_path / "run.usdc")
     stage = usd.Stage.Open(str(path))
     assert geometry.GetStageUpAxis(stage) == "Z"
     assert geometry.GetStageMetersPerUnit(stage) == 1.0
-    assert stage.GetEndTimeCode() == len(run.records) - 1
+    assert stage.GetTimeCodesPerSecond() == 24.0  # of Blender's scenes, which take a time code for a frame
+    assert stage.GetEndTimeCode() == 24.0 * run.records["sim_time"][-1]
     drone = geometry.Xformable(stage.GetPrimAtPath("/World/Drone"))
     for step in (0, 57, len(run.records) - 1):
-        matrix = np.array(drone.ComputeLocalToWorldTransform(step))
+        code = 24.0 * float(run.records["sim_time"][step])
+        matrix = np.array(drone.ComputeLocalToWorldTransform(code))
         np.testing.assert_allclose(matrix[3, :3], run.records["position"][step], atol=1e-9)
         np.testing.assert_allclose(matrix[:3, :3].T, rotation(run.records["quaternion"][step]), atol=1e-5)
     tube = geometry.Mesh(stage.GetPrimAtPath("/World/Tube"))
     assert len(tube.GetFaceVertexCountsAttr().Get()) > 10_000
+    material, _ = shade.MaterialBindingAPI(tube.GetPrim()).ComputeBoundMaterial()
+    surface = shade.Shader(stage.GetPrimAtPath(f"{material.GetPath()}/Surface"))
+    assert 0.0 < surface.GetInput("opacity").Get() < 0.5
+
+
+def test_a_usd_stage_of_a_long_flight_holds_fewer_poses_and_says_so(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pixar's library holds a stage in memory: of more poses than that is for, every n-th and the last are kept."""
+    usd = pytest.importorskip("pxr.Usd")
+    geometry = pytest.importorskip("pxr.UsdGeom")
+    monkeypatch.setattr(export_scene, "MOST_POSES", 100)
+    path, note = export(run.folder, "usd", tmp_path / "run.usdc")
+    assert f"every 5th of {len(run.records)} poses" in note
+    stage = usd.Stage.Open(str(path))
+    drone = geometry.Xformable(stage.GetPrimAtPath("/World/Drone"))
+    kept = sorted({*range(0, len(run.records), 5), len(run.records) - 1})
+    np.testing.assert_allclose(drone.GetTimeSamples(), 24.0 * run.records["sim_time"][kept])
 
 
 @pytest.mark.parametrize("kind", ["csv", "npz", "parquet", "tum", "mcap", "gltf", "usd"])
@@ -166,7 +208,7 @@ def test_a_run_that_was_cut_short_and_moved_is_exported(run: Run, tmp_path: Path
     folder = tmp_path / "moved"
     folder.mkdir()
     manifest = json.loads((run.folder / "manifest.json").read_text())
-    manifest["mesh"]["path"] = "/nowhere/industrial.obj"
+    manifest["mesh"]["path"] = "/nowhere/gone.obj"
     manifest["manifest_sha256"] = manifest_digest(manifest)
     (folder / "manifest.json").write_text(json.dumps(manifest))
     size = run.records.dtype.itemsize
@@ -180,6 +222,7 @@ def test_a_run_that_was_cut_short_and_moved_is_exported(run: Run, tmp_path: Path
 LONG = """
 import resource, sys
 from pathlib import Path
+from cosim import export_scene
 from cosim.export import export
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 export(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]))
@@ -188,7 +231,8 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
 
 
 @pytest.mark.parametrize(
-    ("kind", "steps"), [("parquet", 1_000_000), ("tum", 1_000_000), ("npz", 300_000), ("csv", 60_000)]
+    ("kind", "steps"),
+    [("tum", 1_000_000), ("parquet", 300_000), ("npz", 300_000), ("gltf", 300_000), ("csv", 60_000)],
 )
 def test_a_long_log_is_exported_in_bounded_memory(run: Run, tmp_path: Path, kind: str, steps: int) -> None:
     """A sparse log, of a million steps 1.6 GB long, is streamed: an export takes less than 300 MB of memory."""
