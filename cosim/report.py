@@ -23,6 +23,7 @@ from cosim import __version__
 from cosim.errors import OutputError, RunError
 from cosim.folders import RESULTS
 from cosim.recording import LOG, MANIFEST
+from cosim.report_axis import whole_axis
 from cosim.report_evaluation import describe_evaluation, read_results
 from cosim.report_run import Kept, describe_run
 from cosim.report_tube import describe_tube
@@ -36,8 +37,8 @@ RECORDS: Final = 25_000
 TRIANGLES: Final = 80_000
 """Triangles that a page holds, of all its tubes together; of more, each tube keeps the same share."""
 SCRIPTS: Final = (
-    "data.js", "shapes.js", "tube.js", "senses.js", "view.js", "charts.js", "plots.js", "tables.js",
-    "evaluation.js", "player.js", "page.js",
+    "data.js", "shapes.js", "tube.js", "senses.js", "ending.js", "view.js", "dial.js", "charts.js", "plots.js",
+    "tables.js", "evaluation.js", "player.js", "page.js",
 )  # fmt: skip
 """Parts of the page's one script, in order."""
 
@@ -144,15 +145,20 @@ def _results_in(source: Path) -> Path | None:
 def _describe(runs: Sequence[Run], arrays: Arrays) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """The runs, and the tubes that they were flown in: one for all that share it."""
     stride = -(-sum(len(run.records) for run in runs) // RECORDS)
-    scenes = [read_scene(run) for run in runs]
+    scenes, axes = [read_scene(run) for run in runs], [whole_axis(run) for run in runs]
     keys = [_tube_key(run, scene) for run, scene in zip(runs, scenes, strict=True)]
     shown = list(dict.fromkeys(keys))
     flown_in = [[scene for scene, own in zip(scenes, keys, strict=True) if own == key] for key in shown]
     share = TRIANGLES / max(sum(len(own[0].tube.faces) for own in flown_in), 1)
-    tubes = [describe_tube(own, share, arrays.add) for own in flown_in]
+    whole = {key: axis[0] for key, axis in zip(keys, axes, strict=True) if axis is not None}
+    tubes = [
+        describe_tube(own, whole.get(key), share, arrays.add)
+        for key, own in zip(shown, flown_in, strict=True)
+    ]
     described = [
-        describe_run(run, scene, Kept.of(len(run.records), stride), arrays.add) | {"tube": shown.index(key)}
-        for run, scene, key in zip(runs, scenes, keys, strict=True)
+        describe_run(run, scene, axis, Kept.of(len(run.records), stride), arrays.add)
+        | {"tube": shown.index(key)}
+        for run, scene, axis, key in zip(runs, scenes, axes, keys, strict=True)
     ]
     return described, tubes
 

@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent_client.flight import PHASES
+from agent_client.lidar import ring_sectors
 from agent_client.task import Outcome
+from cosim.report_axis import axis_curvature
+from cosim.report_ending import as_shown, describe_ending
 from cosim.runs import Run, column
 from cosim.scene import Scene
-from meshes.swept import segment_curvature
 
 Floats = NDArray[np.float64]
 AddArray = Callable[[NDArray[Any]], int]
@@ -24,8 +26,6 @@ BINS: Final = 60
 """Of the histograms of time."""
 SHORTEST: Final = 1e-7
 """Least time that a histogram shows (s): its axis is logarithmic."""
-CURVATURE_STEP: Final = 0.5
-"""Arc length over R over which the turn of the axis is taken."""
 
 _TEXTS: Final = {
     "wait": "the exchange, without the engine's own time",
@@ -58,17 +58,22 @@ class Kept:
         return cls(stride, index if index[-1] == records - 1 else np.append(index, records - 1))
 
 
-def describe_run(run: Run, scene: Scene, kept: Kept, add: AddArray) -> dict[str, Any]:
+def describe_run(
+    run: Run, scene: Scene, axis: tuple[Floats, Floats] | None, kept: Kept, add: AddArray
+) -> dict[str, Any]:
     """All that the page tells of a run but its tube, as JSON with the numbers of its arrays.
 
     Args:
         run: with at least one record.
         scene: of the run.
+        axis: all of it, from `whole_axis`.
         kept: the records that go into the page; figures and distributions are made of all.
         add: takes the arrays.
     """
     manifest = run.manifest
     settings = manifest["settings"]
+    curvature = axis_curvature(run, axis)
+    notes = (_STATUS.get(manifest["status"]), _continued(manifest), scene.note)
     return {
         "name": run.folder.resolve().name,
         "folder": str(run.folder),
@@ -80,20 +85,19 @@ def describe_run(run: Run, scene: Scene, kept: Kept, add: AddArray) -> dict[str,
         "records": len(run.records),
         "stride": kept.stride,
         "dt": manifest["session"]["dt"],
-        "notes": [note for note in (_STATUS.get(manifest["status"]), scene.note) if note],
+        "notes": [note for note in notes if note],
+        "ending": describe_ending(run, scene, curvature),
         "body_radius": manifest["parameters"]["body_radius"],
         "lidar": settings["lidar"],
         "camera": settings["camera"] | {"field_of_view": manifest["conditions"]["drawn"]["field_of_view"]},
         "memory_steps": settings["memory"]["steps"],
-        "hidden": settings["masked_features"],
         "terms": list(_labels(run, "reward_terms")),
         "phases": phase_rows(run),
         "drone": {
             "vertices": add(_single(scene.drone.vertices)),
             "faces": add(scene.drone.faces.astype(np.uint16)),
         },
-        "axis": add(_single(scene.axis)),
-        "series": {name: add(values) for name, values in _series(run, scene, kept.index).items()},
+        "series": {name: add(values) for name, values in _series(run, scene, curvature, kept.index).items()},
         "manifest": {name: value for name, value in manifest.items() if name != "record"},
     }
 
@@ -104,6 +108,15 @@ def tube_name(manifest: dict[str, Any]) -> str:
     if drawn is None:
         return Path(manifest["mesh"]["path"]).name
     return f"level {drawn['level']} tube, seed {drawn['seed']}"
+
+
+def _continued(manifest: dict[str, Any]) -> str:
+    """Whose flight a replayed run began with."""
+    continued = manifest.get("continues")
+    if continued is None:
+        return ""
+    step, pilot = continued["from_step"], manifest["policy"]["name"]
+    return f"steps 1 to {step} are those of {continued['run']}, sent again; {pilot} flew on from there"
 
 
 def _story(run: Run) -> dict[str, Any]:
@@ -121,14 +134,14 @@ def _story(run: Run) -> dict[str, Any]:
         "length": run.manifest["mesh"]["length_m"],
         "quality": _number(last["quality"]),
         "gap": _number(clearance[narrowest] - run.manifest["parameters"]["body_radius"]),
-        "gap_time": float(run.records["sim_time"][narrowest]),
+        "gap_time": as_shown(run.records["sim_time"][narrowest]),
         "contacts": int(np.count_nonzero(column(run, "contact"))),
         "steps_per_second": told.get("steps_per_second"),
         "trajectory_hash": run.manifest.get("trajectory_hash") or last["chain"].tobytes().hex(),
     }
 
 
-def _series(run: Run, scene: Scene, index: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+def _series(run: Run, scene: Scene, curvature: Floats, index: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
     """Everything that the page draws or reads out step by step; lengths in m, times in s."""
 
     records = run.records[index]
@@ -139,10 +152,8 @@ def _series(run: Run, scene: Scene, index: NDArray[np.int64]) -> dict[str, NDArr
     def flag(name: str) -> NDArray[np.uint8]:
         return records[name].astype(np.uint8)
 
-    step = CURVATURE_STEP * float(np.median(column(run, "radius")))
-    curvature = curvature_along(column(run, "arc_length"), column(run, "tangent"), step)
     reach = run.manifest["settings"]["lidar"]["reach"]
-    observation, labels = records["observation"], _labels(run, "observation")
+    front, rear = np.split(records["lidar"] / reach, 2, axis=1)
     return {
         "time": _single(scene.times[index]),
         "step": records["step"].astype(np.int32),
@@ -153,6 +164,8 @@ def _series(run: Run, scene: Scene, index: NDArray[np.int64]) -> dict[str, NDArr
         "radius": single("radius"),
         "clearance": single("clearance"),
         "curvature": _single(curvature[index]),
+        "velocity": single("linear_velocity"),
+        "direction": single("direction"),
         "speed": _single(np.linalg.norm(records["linear_velocity"], axis=1)),
         "commanded_speed": single("commanded_speed"),
         "alignment": single("alignment"),
@@ -161,9 +174,9 @@ def _series(run: Run, scene: Scene, index: NDArray[np.int64]) -> dict[str, NDArr
         "reward": single("reward"),
         "reward_terms": single("reward_terms"),
         "regime": flag("regime"),
-        # In the observation S_F and S_R stand as 2x - 1.
-        "S_F": 0.5 * (observation[:, labels.index("s_f")] + np.float32(1.0)),
-        "S_R": 0.5 * (observation[:, labels.index("s_r")] + np.float32(1.0)),
+        # Not from the observation, where they are zero for a policy that was not shown them.
+        "S_F": _single(ring_symmetry(front)),
+        "S_R": _single(ring_symmetry(rear)),
         "C_turn": single("C_turn"),
         "target_visible": flag("target_visible"),
         "target_position": single("target_position"),
@@ -179,26 +192,12 @@ def _series(run: Run, scene: Scene, index: NDArray[np.int64]) -> dict[str, NDArr
     }
 
 
-def curvature_along(arc_length: Floats, tangents: Floats, step: float) -> Floats:
-    """Curvature of the axis (1/m) at every record, (T,), from the axis as it came by.
-
-    Args:
-        arc_length: (T,) of the nearest axis point (m), in any order.
-        tangents: (T, 3) of the axis there.
-        step: arc length over which a turn is taken (m).
-
-    Returns:
-        NaN everywhere for a flight along less than two steps of the axis.
-    """
-    places, first = np.unique(arc_length, return_index=True)
-    count = int((places[-1] - places[0]) / step) + 1
-    if count <= 2:
-        return np.full(len(arc_length), np.nan)
-    even = places[0] + step * np.arange(count)
-    sampled = np.stack([np.interp(even, places, tangents[first, c]) for c in range(3)], axis=1)
-    sampled /= np.linalg.norm(sampled, axis=1, keepdims=True)
-    curvature: Floats = np.interp(arc_length, even[:-1] + 0.5 * step, segment_curvature(sampled, step))
-    return curvature
+def ring_symmetry(readings: Floats) -> Floats:
+    """S = 1 - (|right - left| + |top - bottom|) / 2 of a LiDAR ring (T, rays), readings over the range; (T,)."""
+    sectors = ring_sectors(readings.shape[1])
+    right, top, left, bottom = (readings[:, sectors == k].mean(axis=1) for k in range(4))
+    symmetry: Floats = 1.0 - 0.5 * (np.abs(right - left) + np.abs(top - bottom))
+    return symmetry
 
 
 def phase_rows(run: Run) -> dict[str, Any]:

@@ -19,11 +19,14 @@ AXIS_POINTS: Final = 1500
 _PIECE: Final = 4096
 
 
-def describe_tube(scenes: Sequence[Scene], share: float, add: AddArray) -> dict[str, Any]:
+def describe_tube(
+    scenes: Sequence[Scene], whole: Floats | None, share: float, add: AddArray
+) -> dict[str, Any]:
     """The tube of some scenes that share it, as JSON with the numbers of its arrays.
 
     Args:
         scenes: of the runs; the longest axis counts.
+        whole: (M, 3) all of its axis (m), None where only what was flown is known.
         share: of its triangles that the page has room for.
         add: takes the arrays.
 
@@ -37,7 +40,7 @@ def describe_tube(scenes: Sequence[Scene], share: float, add: AddArray) -> dict[
         "vertices": add(shown.vertices.astype(np.float32)),
         "faces": add(shown.faces.astype(np.uint16 if len(shown.vertices) <= 2**16 else np.uint32)),
         "outward": add(outward(shown.vertices, axis)),
-        "axis": add(axis.astype(np.float32)),
+        "axis": add((axis if whole is None else _thin(whole, AXIS_POINTS)).astype(np.float32)),
         "triangles": len(shown.faces),
         "triangles_flown": len(tube.faces),
     }
@@ -66,7 +69,7 @@ def outward(vertices: Floats, axis: Floats) -> NDArray[np.int8]:
 
     Zero for vertices beyond the ends of the axis: that part of the tube was not flown, and stays closed.
     """
-    axis = axis[:: -(-len(axis) // AXIS_POINTS)]
+    axis = _thin(axis, AXIS_POINTS)
     if len(axis) < 2:
         return np.zeros(vertices.shape, np.int8)
     tangent = np.gradient(axis, axis=0)
@@ -85,3 +88,8 @@ def outward(vertices: Floats, axis: Floats) -> NDArray[np.int8]:
             beyond[:, None], 0.0, away / np.maximum(width, 1e-12)[:, None]
         )
     return np.rint(127.0 * found).astype(np.int8)
+
+
+def _thin(points: Floats, most: int) -> Floats:
+    """Every n-th of some points, so that there are not more than `most`."""
+    return points[:: -(-len(points) // most)]

@@ -57,8 +57,8 @@ const CHARTS = [
     floor: 0,
     ceiling: 1,
     curves: (run) => [
-      { label: "front S_F", values: seen(run, "s_f") ? run.series.S_F : null },
-      { label: "rear S_R", values: seen(run, "s_r") ? run.series.S_R : null },
+      { label: "front S_F", values: run.series.S_F },
+      { label: "rear S_R", values: run.series.S_R },
       { label: "turn C_turn", values: run.series.C_turn },
     ],
   },
@@ -83,11 +83,6 @@ const CHARTS = [
     ],
   },
 ];
-
-/** Whether the policy was shown a feature: what it was not shown is zero in its observation. */
-function seen(run, feature) {
-  return !run.hidden.includes(feature);
-}
 
 function rewardCurves(run) {
   run.reward_curves ??= (() => {

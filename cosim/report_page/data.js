@@ -27,7 +27,6 @@ async function readData() {
   }
   data.runs.forEach((run, number) => {
     run.number = number;
-    run.axis = array(run.axis);
     run.drone = { vertices: array(run.drone.vertices), faces: array(run.drone.faces) };
     for (const name of Object.keys(run.series)) run.series[name] = array(run.series[name]);
     run.count = run.series.time.length;
@@ -61,7 +60,7 @@ const REGIMES = ["", "visible", "memory", "blind"];
 /** A number for people: `digits` significant ones, a true minus sign, a dash for what is not known. */
 function say(value, digits = 3) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
-  if (value === 0) return "0";
+  if (Math.abs(value) < 5e-7) return "0";
   const size = Math.floor(Math.log10(Math.abs(value)));
   const text = size >= digits ? Math.round(value).toLocaleString("en") : value.toFixed(Math.min(digits - 1 - size, 6));
   return text.replace("-", "−");

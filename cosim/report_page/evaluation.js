@@ -130,10 +130,10 @@ function replayOf(failure, runs, onFocus) {
   const link = make(
     "a",
     {
-      href: `#run=${run.number}&end`,
+      href: `#run=${run.number}`,
       onclick: (event) => {
         event.preventDefault();
-        onFocus(run, run.end);
+        onFocus(run);
       },
     },
     "replay",

@@ -64,10 +64,7 @@ class Report {
 
   _words() {
     const { data, runs } = this,
-      seek = (time) => {
-        this.player.pause();
-        this.player.seek(time);
-      };
+      seek = (time) => this.lookAt(time);
     byId("made").textContent = `made by cosim ${data.made.cosim} on ${data.made.at}`;
     const fill = (id, ...content) => {
       byId(id).hidden = false;
@@ -78,7 +75,7 @@ class Report {
       fill(
         "evaluations",
         ...data.evaluations.flatMap((evaluation) =>
-          evaluationOf(evaluation, runs, (run, time) => this.focusOn(run, time)),
+          evaluationOf(evaluation, runs, (run) => this.focusOn(run)),
         ),
       );
     } else if (!this.many) byId("headline").append(...headlineOf(runs[0], seek), ...thinnedNotes(data));
@@ -113,6 +110,7 @@ class Report {
       this.player.pause();
       this.player.seek(time);
     });
+    this.dial = new Dial(byId("dial"));
     try {
       this.view = new View(data, byId("canvas"));
     } catch (error) {
@@ -128,9 +126,10 @@ class Report {
     this.view?.resize();
     this.player.seek(0);
     this.view?.setCamera("overview");
+    if (!this.many && first.ending) this.goTo(first.ending.time);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.paint());
     const [, number] = location.hash.match(/run=(\d+)/) ?? [];
-    if (runs[number]) this.focusOn(runs[number], /end/.test(location.hash) ? runs[number].end : 0);
+    if (runs[number]) this.focusOn(runs[number]);
   }
 
   _controls() {
@@ -215,6 +214,7 @@ class Report {
     this.visible = visible;
     this.view?.choose(focus, visible);
     this.plots.choose(focus, visible);
+    byId("ending").replaceChildren(...endingOf(focus, (time) => this.lookAt(time)));
     byId("phase-rows").replaceChildren(...phasesOf(focus));
     byId("facts").replaceChildren(...factsOf(focus));
     for (const row of document.querySelectorAll("[data-run]")) {
@@ -225,13 +225,32 @@ class Report {
   }
 
   /** Look at a run: what it senses, its phases and settings, and, where it flew elsewhere, its tube. */
-  focusOn(run, time = this.player.time) {
+  focusOn(run) {
     const same = run.tube === this.focus.tube;
     this.player.pause();
     this.choose(run, same ? this.visible : new Set(this.runs.filter((other) => other.tube === run.tube)));
+    if (run.ending) this.goTo(run.ending.time);
+    else {
+      this.player.seek(this.player.time);
+      this.view?.setCamera(this.view.cameraMode);
+    }
+    byId("replay").scrollIntoView({ block: "start" });
+  }
+
+  /** Rest at a time (s), close to the drone. */
+  goTo(time) {
+    this.player.pause();
     this.player.seek(time);
-    this.view?.setCamera(this.view.cameraMode);
-    byId("view").scrollIntoView({ block: "start" });
+    if (!this.view) return;
+    if (this.view.cameraMode === "overview") byId("camera").value = "follow";
+    this.view.setCamera(byId("camera").value);
+    this.view.faceEnding();
+  }
+
+  /** Go there for a reader who may have scrolled the view away. */
+  lookAt(time) {
+    this.goTo(time);
+    byId("view").scrollIntoView({ block: "nearest" });
   }
 
   show(run, shown) {
@@ -267,6 +286,7 @@ class Report {
       ["entropy", Number.isFinite(s.entropy[i]) ? `${fixed(s.entropy[i], 2)} nat` : "–"],
     ];
     if (this.many) entries.unshift(["run", run.label]);
+    this.dial.place(run, i);
     byId("readout").replaceChildren(
       ...entries.map(([name, value]) => make("div", {}, make("dt", {}, name), make("dd", {}, value))),
     );

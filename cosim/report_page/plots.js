@@ -1,7 +1,7 @@
 // Curves over time or arc length, drawn as SVG so that they follow the colour scheme and print well.
 
 const HEIGHT = 132,
-  MARGIN = { left: 48, right: 8, top: 6, bottom: 18 };
+  MARGIN = { left: 54, right: 8, top: 6, bottom: 18 };
 
 /** Ticks at 1, 2 or 5 times a power of ten, about `count` of them. */
 function ticks(low, high, count) {
@@ -46,6 +46,21 @@ function trace(xs, ys, from, to, toX, toY, width) {
     for (const i of [...new Set([start, Math.min(least, most), Math.max(least, most), stop])]) put(i);
   }
   return path;
+}
+
+/** Runs of records of one value; where a pixel has several records, the worst of them is its value. */
+function bands(xs, values, from, to, toX, worse) {
+  const found = [];
+  for (let i = from; i <= to; ) {
+    const start = i,
+      pixel = Math.floor(toX(xs[i]));
+    let value = values[i];
+    while (i <= to && Math.floor(toX(xs[i])) === pixel) value = worse(value, values[i++]);
+    const last = found.at(-1);
+    if (last?.value === value) last.end = i - 1;
+    else found.push({ start, end: i - 1, value });
+  }
+  return found;
 }
 
 class Chart {
@@ -99,7 +114,13 @@ class Chart {
     if (definition.strip) this._strips(body);
     else if (this.drawn.length) this._curves(body, left, right);
     else
-      body.append(make("text", { x: left, y: HEIGHT / 2, class: "missing" }, definition.missing ?? "nothing recorded"));
+      body.append(make("text", { x: left + 8, y: HEIGHT / 2, class: "missing" }, definition.missing ?? "nothing recorded"));
+    const met = plots.focus.ending;
+    if (met) {
+      const x = this.toX(plots.abscissa(plots.focus)[recordAt(plots.focus, met.time).record]);
+      if (x >= left && x <= right)
+        body.append(make("line", { x1: x, x2: x, y1: MARGIN.top, y2: HEIGHT - MARGIN.bottom, class: "limit bad" }));
+    }
     const unit = plots.by === "time" ? " s" : " m";
     const below = ticks(x0, x1, width / 90).map(({ value, text }, i, all) =>
       make("text", { x: this.toX(value), y: HEIGHT - 4, class: "tick x" }, i === all.length - 1 ? text + unit : text),
@@ -150,40 +171,35 @@ class Chart {
     const { plots } = this,
       many = plots.runs.length > 1;
     const rows = many
-      ? plots.runs.map((run) => ({ label: "", run, values: run.series.regime, kind: "regime" }))
+      ? plots.runs.map((run) => ({ label: "", run, values: run.series.regime, kind: "regime", worse: Math.max }))
       : ["regime", "target_visible", "memory_available", "contact"].map((name) => ({
           label: { regime: "regime", target_visible: "target", memory_available: "memory", contact: "contact" }[name],
           run: plots.runs[0],
           values: plots.runs[0].series[name],
           kind: name === "regime" ? name : `${name} flag`,
+          worse: name === "regime" || name === "contact" ? Math.max : Math.min,
         }));
     const high = (HEIGHT - MARGIN.top - MARGIN.bottom) / rows.length;
-    rows.forEach(({ label, run, values, kind }, row) => {
+    rows.forEach(({ label, run, values, kind, worse }, row) => {
       const xs = plots.abscissa(run),
         [from, to] = plots.records(run),
         y = MARGIN.top + row * high;
       if (many)
         body.append(make("circle", { cx: MARGIN.left - 12, cy: y + high / 2, r: 4, style: `fill:${runColour(run)}` }));
       else body.append(make("text", { x: MARGIN.left - 6, y: y + high / 2 + 3.5, class: "tick y" }, label));
-      let start = from;
-      for (let i = from; i <= to; i++) {
-        // Records of one pixel are one band, of the worst of them.
-        if (i < to && (values[i + 1] === values[start] || this.toX(xs[i + 1]) - this.toX(xs[start]) < 1)) continue;
-        let worst = 0;
-        for (let j = start; j <= i; j++) worst = Math.max(worst, values[j]);
+      for (const { start, end, value } of bands(xs, values, from, to, this.toX, worse)) {
         const a = this.toX(xs[start]),
-          b = this.toX(xs[Math.min(i + 1, to)]);
-        if (worst)
+          b = this.toX(xs[Math.min(end + 1, to)]);
+        if (value)
           body.append(
             make("rect", {
               x: Math.min(a, b),
               y: y + 2,
               width: Math.max(Math.abs(b - a), 0.7),
               height: high - 4,
-              class: `${kind} v${worst}`,
+              class: `${kind} v${value}`,
             }),
           );
-        start = i + 1;
       }
     });
   }

@@ -87,17 +87,20 @@ class View {
     this.tubes = data.tubes.map((tube) => new TubeView(tube));
     this.axes = data.tubes.map((tube) => still(tube.axis, 1.5, 0.8));
     this.runs = data.runs.map((run) => new RunView(run));
+    const met = data.runs.filter((run) => run.ending?.wall);
+    this.endings = met.map((run) => new EndingView(run, canvas.parentElement));
     this.senses = new SensesView(Math.max(...data.runs.map((run) => run.lidar.rays)));
     this.scene.add(this.senses.group, new THREE.HemisphereLight(0xffffff, 0x888888, 2.2));
     const sun = new THREE.DirectionalLight(0xffffff, 1.6);
     sun.position.set(3, -4, 8);
     this.scene.add(sun);
     for (const part of [...this.tubes, ...this.runs]) this.scene.add(part.group);
-    this.scene.add(...this.axes);
+    this.scene.add(...this.axes, ...this.endings.map((ending) => ending.spot));
     this.camera = new THREE.PerspectiveCamera(50, 1, 0.02, 1000);
     this.camera.up.copy(UP);
     this.controls = new THREE.OrbitControls(this.camera, canvas);
     this.controls.enableDamping = false;
+    canvas.style.touchAction = "pan-y"; // a finger that goes up or down scrolls the page
     this.controls.addEventListener("change", () => this.redraw());
     this.layers = { path: true, axis: true, rays: true, cone: true, target: true };
     this.tubeMode = "glass";
@@ -111,7 +114,7 @@ class View {
   paint(pathColours) {
     this.tubes.forEach((tube) => tube.paint(this.cameraMode === "aboard" ? HAZE / this.radius : 0));
     for (const axis of this.axes) axis.material.color.set(cssColour("--axis"));
-    this.senses.paint();
+    for (const part of [this.senses, ...this.endings]) part.paint();
     for (const view of this.runs) {
       const colour = cssColour(this.runs.length > 1 ? `--run-${view.run.number % 8}` : "--drone");
       view.drone.material.color.set(colour);
@@ -174,6 +177,21 @@ class View {
     this.tubes.forEach((tube) => tube.paint(mode === "aboard" ? HAZE / this.radius : 0));
     this.place(this.time);
     if (this.controls.enabled) this.controls.update();
+  }
+
+  /** Following near the end of a flight that met a wall, stand where course and wall are seen side on. */
+  faceEnding() {
+    const { wall, time } = this.focus.ending ?? {};
+    if (!wall || this.cameraMode !== "follow" || Math.abs(this.time - time) > 3) return;
+    const { tangent, position } = this.focus.series,
+      { record } = recordAt(this.focus, time);
+    const along = vectorAt(tangent, record, new THREE.Vector3()),
+      place = vectorAt(position, record, new THREE.Vector3());
+    const side = new THREE.Vector3().fromArray(wall).sub(place).cross(along);
+    if (side.length() < 1e-6) return;
+    side.normalize().multiplyScalar(side.z < 0 ? -1 : 1).addScaledVector(along, -0.3).normalize();
+    this.camera.position.copy(this.controls.target).addScaledVector(side, FOLLOW_DISTANCE * this.radius);
+    this.controls.update();
   }
 
   /** Stand where the whole tube of the focus fills the view, on the side from which the way looks longest. */
@@ -282,6 +300,9 @@ class View {
           view.drone.visible &&
           this.camera.position.distanceTo(view.drone.position) > 2 * FOLLOW_DISTANCE * this.radius;
       }
+      this.camera.updateMatrixWorld();
+      for (const ending of this.endings)
+        ending.pin(this.camera, this.width, this.height, ending.run === this.focus && this.layers.path);
       this.renderer.render(this.scene, this.camera);
       clearTimeout(this.resting);
       if (!this.quick) this.resting = setTimeout(() => this._smooth(), REST);

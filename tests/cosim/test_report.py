@@ -14,7 +14,8 @@ from pages import PageData, copy_run, evaluation_results, read_page
 
 from cosim.recording import LOG, MANIFEST
 from cosim.report import PAGE, report
-from cosim.report_run import Kept, curvature_along
+from cosim.report_axis import curvature_along
+from cosim.report_run import Kept
 from cosim.report_tube import outward, simplify
 from cosim.runs import read_run
 from cosim.scene import Surface
@@ -76,7 +77,8 @@ def test_the_page_holds_what_was_recorded(content: PageData, conduit_run: tuple[
 
 def test_symmetry_is_that_of_the_recorded_scans(content: PageData, conduit_run: tuple[Done, Path]) -> None:
     """S_F as plotted is one minus half the asymmetries of the front ring's four sectors, computed anew."""
-    records = read_run(conduit_run[1]).records
+    run = read_run(conduit_run[1])
+    records = run.records
     rays = records["lidar"].shape[1] // 2
     angle = 2.0 * np.pi * np.arange(rays) / rays
     front = records["lidar"][:, :rays] / content.data["runs"][0]["lidar"]["reach"]
@@ -86,6 +88,9 @@ def test_symmetry_is_that_of_the_recorded_scans(content: PageData, conduit_run: 
     expected = 1.0 - 0.5 * (np.abs(right - left) + np.abs(top - bottom))
     plotted = content.array(content.data["runs"][0]["series"]["S_F"])
     np.testing.assert_allclose(plotted, expected, atol=1e-6)
+    labels = next(column.labels for column in run.columns if column.name == "observation")
+    shown = records["observation"][:, labels.index("s_f")]
+    np.testing.assert_allclose(2.0 * plotted - 1.0, shown, atol=1e-6, err_msg="as the policy was shown it")
 
 
 def test_phases_add_up(content: PageData) -> None:
@@ -107,8 +112,11 @@ def test_curvature_of_a_helix_is_the_closed_form() -> None:
     tangents = np.stack([-a * np.sin(phase), a * np.cos(phase), np.full_like(phase, b)], axis=1) / np.hypot(
         a, b
     )
-    np.testing.assert_allclose(curvature_along(arc, tangents, 0.5), a / (a * a + b * b), rtol=5e-3)
-    assert np.isnan(curvature_along(np.array([1.0, 1.2]), tangents[:2], 0.5)).all()
+    np.testing.assert_allclose(curvature_along(arc, arc, tangents, 0.5), a / (a * a + b * b), rtol=5e-3)
+    short = np.argsort(arc)[:8]  # less than a step of the axis
+    found = curvature_along(arc[:3], arc[short], tangents[short], 0.5)
+    np.testing.assert_allclose(found, a / (a * a + b * b), rtol=5e-2)
+    assert np.isnan(curvature_along(arc[:3], arc[:1], tangents[:1], 0.5)).all()
 
 
 def test_outward_is_radial_where_the_axis_is_and_zero_beyond() -> None:

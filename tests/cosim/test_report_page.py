@@ -168,7 +168,7 @@ def test_every_chart_has_its_curves_and_the_cursor_goes_along(opened: Browser) -
     chart = opened.driver.find_element("css selector", "#chart-speed svg")
     chart.click()  # in its middle
     middle = opened.run("return report.state().record / report.runs[0].count")
-    assert middle == pytest.approx(0.5, abs=0.06)
+    assert middle == pytest.approx(0.5, abs=0.08)
 
 
 def test_curves_are_drawn_by_arc_length_and_over_a_span_too(opened: Browser) -> None:
@@ -237,6 +237,72 @@ def test_a_failure_is_linked_to_its_replay(browser: Browser, overlay: Path, run:
     )
 
 
+def test_a_flight_that_met_a_wall_opens_at_that_moment(browser: Browser, run: Run, tmp_path: Path) -> None:
+    """The page rests on the record of the first contact, with the place marked in view and what was seen before."""
+    crashed = copy_run(run.folder, tmp_path / "run", records=60)
+    records = np.frombuffer(
+        bytearray((crashed / LOG).read_bytes())[: 60 * run.records.itemsize], run.records.dtype
+    )
+    records["outcome"][-1], records["contact"][53:] = 3, True
+    (crashed / LOG).write_bytes(records.tobytes())
+    browser.open(report([crashed]))
+    assert browser.run("return report.state().record") == 53
+    assert_at(run, 53, places(browser)[0])
+    mark = browser.run("return report.view.endings[0].spot.position.toArray()")
+    gap = np.linalg.norm(np.array(mark) - run.records["position"][53])
+    assert gap == pytest.approx(run.records["clearance"][53], rel=0.02)
+    pin = browser.run(
+        "const pin = document.querySelector('.pin').getBoundingClientRect();"
+        "const view = document.getElementById('view').getBoundingClientRect();"
+        "return pin.left > view.left && pin.right < view.right && pin.top > view.top && pin.bottom < view.bottom"
+    )
+    assert pin
+    assert "It touched the wall in step 53" in browser.run(
+        "return document.getElementById('ending').innerText"
+    )
+    browser.driver.find_elements("css selector", "#ending button")[1].click()
+    assert browser.run("return report.state().record") == 52
+    assert browser.complaints() == []
+
+
+def test_the_headline_is_what_the_flight_reported(
+    opened: Browser, conduit_run: tuple[Done, Path], run: Run
+) -> None:
+    """Figures at the top are those of `cosim launch --json`, rounded; the smallest gap leads to its own record."""
+    told = conduit_run[0].report
+    figures = dict(
+        opened.run(
+            "return [...document.querySelectorAll('.figures > div')]"
+            ".map((one) => [...one.children].map((e) => e.innerText))"
+        )
+    )
+    assert figures == {
+        "progress": f"{100 * told['progress']:.1f} %",
+        "quality Q": f"{told['quality']:.3f}",
+        "smallest gap": f"{told['min_clearance_m']:.3f} m",
+        "steps with contact": str(told["contacts"]),
+        "loop": f"{round(told['steps_per_second']):,} /s",
+        "seed": str(run.manifest["options"]["seed"]),
+    }
+    opened.driver.find_element("css selector", ".figures button").click()
+    assert opened.run("return report.state().record") == int(run.records["clearance"].argmin())
+
+
+def test_what_is_sensed_is_drawn_without_the_view(opened: Browser, run: Run) -> None:
+    """The section seen from behind has the scan's corners at the recorded distances, and the decision of the step."""
+    opened.run("report.player.seekRecord(30)")
+    scale = opened.run("return report.dial.scale")
+    ring = opened.run("return report.dial.marks.front.getAttribute('d')")
+    corners = np.array([[float(x) for x in pair.split()] for pair in ring.strip("MZ").split("L")])
+    rays = len(corners)
+    np.testing.assert_allclose(
+        np.linalg.norm(corners, axis=1) / scale, run.records["lidar"][30][:rays], atol=0.01
+    )
+    right, above = corners[0], corners[rays // 4]
+    assert right[0] > 0.0 > above[1]
+    assert opened.run("return report.dial.marks.decided.getAttribute('visibility')") == "visible"
+
+
 @pytest.mark.parametrize("which", ["page", "overlay"])
 def test_it_fits_a_phone(browser: Browser, which: str, request: pytest.FixtureRequest) -> None:
     """In a window of 390 pixels nothing is wider than the window, and slider and play can be reached."""
@@ -292,3 +358,24 @@ def test_it_does_without_webgl(browser: Browser, page: Path, tmp_path: Path) -> 
     assert "no WebGL" in browser.run("return document.getElementById('no-view').textContent")
     browser.run("report.player.seekRecord(100)")
     assert browser.run("return document.querySelectorAll('path.curve').length") > 10
+
+
+def test_strips_show_what_was_recorded_however_many_records_a_pixel_has(opened: Browser) -> None:
+    """One bad record among thousands colours its own pixel and no more; one lost sight leaves a gap as wide."""
+    found = opened.run(
+        "const count = 20000, chart = report.plots.charts.find((one) => one.definition.strip);"
+        "const run = report.runs[0], old = { ...run.series }, counted = run.count;"
+        "run.count = count;"
+        "run.series.time = Float32Array.from({ length: count }, (_, i) => 0.1 * i);"
+        "for (const name of ['regime', 'target_visible', 'memory_available', 'contact'])"
+        "  run.series[name] = new Uint8Array(count).fill(name === 'contact' ? 0 : 1);"
+        "run.series.regime[1005] = 2; run.series.target_visible[15000] = 0;"
+        "chart.draw();"
+        "const widths = (kind) => [...chart.svg.querySelectorAll(kind)].map((band) => +band.getAttribute('width'));"
+        "const found = [widths('.regime.v2'), widths('.target_visible')];"
+        "run.count = counted; Object.assign(run.series, old); chart.draw();"
+        "return found"
+    )
+    (memory,), seen = found
+    assert memory < 3.0
+    assert len(seen) == 2
