@@ -14,11 +14,12 @@ from agent_client.tubes import TubeRecipe, draw_tube
 from cosim.errors import OutputError
 from cosim.options import SHIPPED_MESH, FlightOptions
 from cosim.pilots import existing_file
+from cosim.recording import MANIFEST
 from meshes.errors import CentrelineError
 from meshes.formats import AxesChoice
 from meshes.geometry import Geometry
 from meshes.mesh_geometry import MeshGeometry
-from meshes.scale import MeanRadius
+from meshes.scale import MeanRadius, guess_unit
 from meshes.tube import INDUSTRIAL, Tube, read_tube
 from meshes.wall import place
 from protocol.plant import TubeReference
@@ -66,7 +67,7 @@ def find_mesh(options: FlightOptions) -> Path | None:
 
 
 def read_conduit(options: FlightOptions, mesh: Path, folder: Path, body_radius: float) -> Conduit:
-    """The tube of a mesh; a centreline that is found is written to `folder`.
+    """The tube of a mesh; a centreline that is found, or stands in the folder of another run, is written to `folder`.
 
     Args:
         options: name centreline, axes, scale and ends.
@@ -82,7 +83,7 @@ def read_conduit(options: FlightOptions, mesh: Path, folder: Path, body_radius: 
     start_end: Literal["first", "last"] = "last" if options.start_end == "last" else "first"
     tube = read_tube(mesh, options.centerline, axes, options.scale, start_end, options.entry, options.exit)
     found = tube.found
-    _check_room(tube, body_radius)
+    check_room(tube, body_radius)
     written: tuple[Path, ...] = ()
     if found is not None:
         # Flown along as it is written, to the last bit: what is made of the folder is made of the same.
@@ -92,8 +93,11 @@ def read_conduit(options: FlightOptions, mesh: Path, folder: Path, body_radius: 
         except BaseException:
             written[0].unlink(missing_ok=True)
             raise
+    centreline = tube.centreline_path
+    if found is None and centreline is not None and (centreline.parent / MANIFEST).exists():
+        written = (centreline := _copy_centreline(centreline, folder),)
     reference = TubeReference(str(tube.path.resolve()), tube.axes, tube.scale, tube.sha256)
-    described = _describe(tube.path, reference, tube.centreline_path, tube.centreline_sha256, tube.length)
+    described = _describe(tube.path, reference, centreline, tube.centreline_sha256, tube.length)
     described["found"] = None if found is None else _describe_found(tube, found)
     described["companions"] = dict(tube.wall.companions)
     notes = (*_scale_notes(tube, options), *(() if found is None else _found_notes(tube, found, options)))
@@ -183,15 +187,30 @@ def _store_centreline(tube: Tube, found: FoundCentreline, folder: Path) -> Path:
     return path
 
 
+def _copy_centreline(centreline: Path, folder: Path) -> Path:
+    """Copy the centreline of another run into the run folder, which then needs no other."""
+    path = folder / centreline.name
+    _refuse_existing(path)
+    try:
+        path.write_bytes(centreline.read_bytes())
+    except OSError as error:
+        path.unlink(missing_ok=True)
+        raise OutputError(f"{folder}: the centreline cannot be written: {error.strerror}") from error
+    return path
+
+
 def _refuse_existing(path: Path) -> None:
     if path.exists():
         raise OutputError(f"--out {path.parent}: expected a folder without {path.name}, found one")
 
 
-def _check_room(tube: Tube, body_radius: float) -> None:
-    """Refuse a tube that is too narrow for the drone somewhere along a centreline that was found.
+def check_room(tube: Tube, body_radius: float) -> None:
+    """Refuse a tube that is too narrow for the drone, of some radius (m), along a centreline that was found.
 
     A centreline of the user's may pass closer to the wall than the drone does.
+
+    Raises:
+        CentrelineError: it is too narrow; says where, and what scale makes it wide enough.
     """
     if tube.found is None:
         return
@@ -220,10 +239,9 @@ def _scale_notes(tube: Tube, options: FlightOptions) -> Iterator[str]:
         yield f"scale: {tube.scale:g} m a unit, as {stated.where}"
     if not USUAL_RADIUS[0] <= mean <= USUAL_RADIUS[1]:
         yield f"scale: a mean radius of {mean:.3g} m, where tubes of 1 m suit the drone (--scale radius=1)"
-        if options.scale is None and stated.unit is None:
-            from meshes.inspection import guess_unit
-
-            yield f"scale: taken as metres: {guess_unit(mean / tube.scale, stated).reason}"
+        guess = guess_unit(mean / tube.scale, stated)
+        if options.scale is None and guess.advice:
+            yield f"scale: taken as {tube.scale:g} m a unit, but {guess.reason}; {guess.advice}"
     if options.axes == "auto" and stated.axes is not None:
         yield f"axes: {'Y' if tube.axes == 'yup' else 'Z'} up, as {stated.where}"
 

@@ -5,11 +5,11 @@ the two ends (`meshes.openings`), and its points moved into the centres of their
 (`meshes.centring`). The centre of a section is where the distance of the wall, over the angle, has no first
 harmonic: the axis of a round, elliptic or lobed section.
 
-Libraries that were considered: vmtk takes the same way with the Voronoi balls of the *vertices*, brings VTK with it
-and is not on PyPI; skeletor contracts or slices the graph of the vertices, which a tube of 60 vertices and a double
-wall defeat; scikit-image's minimal paths and scipy's distance transform need a grid of voxels, whose memory grows
-with the volume of the bounding box and whose step limits the accuracy. Taken from scipy are the k-d tree, the
-shortest path, the connected components and the smoothing filter, from Embree the rays.
+Libraries that were considered: vmtk takes the same way with the Voronoi balls of the *vertices*, brings VTK
+with it and asks for Python 3.12; skeletor contracts or slices the graph of the vertices, which a tube of 60 vertices
+and a double wall defeat; scikit-image's minimal paths and scipy's distance transform need a grid of voxels, whose
+memory grows with the volume of the bounding box and whose step limits the accuracy. Taken from scipy are the k-d
+tree, the shortest path and the connected components, from Embree the rays.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ from meshes.centring import wall_ahead
 from meshes.closest import build_tree, wall_distance
 from meshes.curves import arc_lengths
 from meshes.errors import CentrelineError
-from meshes.formats import Stated
 from meshes.geometry import Floats
 from meshes.lumen import draw_balls
 from meshes.openings import Opening
@@ -39,8 +38,6 @@ SECOND_WALL: Final = 1.0
 """A second wall within so many radii behind the first belongs to the same tube."""
 MOST_FLIPPED: Final = 0.05
 """Share of the faces seen from inside whose normals may differ from the others'."""
-LARGEST_IN_METRES: Final = 10.0
-"""Radius of tubes in metres at most: beyond it, millimetres are likelier, the unit of most CAD programs."""
 
 
 @dataclass(frozen=True)
@@ -114,15 +111,6 @@ class Construction:
     openings: tuple[Opening, ...]
     holes: int
     """Holes and slits in the wall that are no openings."""
-
-
-@dataclass(frozen=True)
-class UnitGuess:
-    """What the unit of a file is likely to be."""
-
-    metres: float
-    """In one unit."""
-    reason: str
 
 
 def measure_profile(tube: Tube) -> Profile:
@@ -216,19 +204,6 @@ def find_all_openings(tube: Tube) -> tuple[list[Opening], list[Opening]]:
     except CentrelineError:  # a centreline that a user drew through what is no tube by itself
         return [], []
     return choice[2], choice[3]
-
-
-def guess_unit(radius: float, stated: Stated) -> UnitGuess:
-    """What one unit of a file is likely to be, from the radius of its tube in this unit."""
-    if stated.unit is not None:
-        return UnitGuess(stated.unit, stated.where)
-    if radius > LARGEST_IN_METRES:
-        return UnitGuess(
-            0.001,
-            f"R {radius:.3g} without a unit looks like millimetres: {radius:.3g} mm; say --scale 0.001, or make it "
-            "as wide as suits the drone with --scale radius=1",
-        )
-    return UnitGuess(1.0, f"R {radius:.3g} without a unit looks like metres")
 
 
 def _inside(points: Floats, tangents: Floats, step: float) -> Floats:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from tubular import Mesh, circle, cut, extrude, helix, in_tube, join, line, wall_of
 
 from meshes.formats import UNSTATED, Stated
-from meshes.inspection import examine, guess_unit, measure_profile
+from meshes.inspection import examine, measure_profile
+from meshes.scale import guess_unit
 from meshes.sweep import write_centreline_obj, write_obj
 from meshes.tube import Tube, read_tube
 
@@ -127,13 +128,16 @@ def test_openings_are_told_beside_a_given_centreline(tmp_path: Path) -> None:
 
 
 def test_unit_is_guessed_from_the_size_and_its_reason_given() -> None:
-    """R 44 without a unit looks like millimetres, R 0.3 like metres; a file that states its unit is believed."""
+    """R 44 without a unit looks like millimetres, R 0.3 like metres; a file that states its unit is believed unless
+    its tube would be wider than tubes are."""
     assert guess_unit(44.0, UNSTATED).metres == 0.001
     assert "looks like millimetres: 44 mm" in guess_unit(44.0, UNSTATED).reason
-    assert "--scale" in guess_unit(44.0, UNSTATED).reason
-    assert guess_unit(0.3, UNSTATED).metres == 1.0
+    assert "--scale" in guess_unit(44.0, UNSTATED).advice
+    assert (guess_unit(0.3, UNSTATED).metres, guess_unit(0.3, UNSTATED).advice) == (1.0, "")
     stated = Stated("zup", 0.01, "the file states 0.01 m a unit and Z_UP")
     assert guess_unit(44.0, stated) == guess_unit(0.3, stated)
+    lying = guess_unit(44.0, Stated("yup", 1.0, "glTF is in metres with Y up"))
+    assert "(44 m) looks like millimetres" in lying.reason
 
 
 def test_faces_of_rays_are_those_that_they_meet() -> None:
