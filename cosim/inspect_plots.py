@@ -51,27 +51,39 @@ def draw_profile(path: Path, name: str, profile: Profile, body_radius: float) ->
     axes[0].plot(s, profile.radius, color=_RADIUS, label="mean")
     axes[0].plot(s, profile.clearance, color=_CLEARANCE, linestyle="--", label="nearest wall")
     axes[0].axhline(body_radius, color=_BODY, linestyle=":", label=f"drone ({body_radius:g} m)")
-    axes[0].set(ylabel="wall distance (m)", ylim=(0.0, 1.35 * float(profile.greatest.max())), title=name)
+    axes[0].fill_between(
+        s, body_radius, profile.clearance, color=_CLEARANCE, alpha=0.12, label="clearance for the drone"
+    )
+    highest = max(float(profile.greatest.max()), body_radius)
+    axes[0].set(ylabel="wall distance (m)", ylim=(0.0, 1.4 * highest), title=name)
     _mark(axes[0], s[profile.narrowest], "narrowest")
 
-    axes[1].plot(s, profile.bend, color=_BEND, label="curvature x R")
-    axes[1].set(ylabel="curvature x R", ylim=(0.0, max(0.5, 1.2 * float(profile.bend.max()))))
-    _mark(axes[1], s[profile.tightest], "tightest")
+    axes[1].plot(s, profile.curvature, color=_BEND, label="curvature")
+    highest = max(0.3 / float(profile.radius.mean()), float(profile.curvature.max()))
+    axes[1].set(ylabel="curvature (1/m)", ylim=(0.0, 1.4 * highest))
+    times_radius = axes[1].twinx()
+    times_radius.plot(s, profile.bend, color=_RADIUS, linestyle=":")
+    times_radius.set(ylabel="curvature x R", ylim=(0.0, 1.4 * max(0.3, float(profile.bend.max()))))
+    axes[1].plot([], [], color=_RADIUS, linestyle=":", label="times the local radius R (right)")
+    _mark(axes[1], s[profile.tightest], "tightest bend")
 
     axes[2].plot(s, profile.torsion, color=_TORSION, label="torsion (none where it is straight)")
     axes[2].axhline(0.0, color="black", linewidth=0.6)
     axes[2].set(ylabel="torsion (1/m)", ylim=_torsion_limits(profile))
 
-    axes[3].plot(s, profile.harmonics[:, 1], color=_RADIUS, label="ellipticity (R)")
-    axes[3].plot(s, profile.harmonics[:, 2:].max(axis=1), color=_BEND, label="strongest lobes (R)")
+    axes[3].plot(s, profile.harmonics[:, 1], color=_RADIUS, label="ellipticity (share of R)")
+    axes[3].plot(s, profile.harmonics[:, 2:].max(axis=1), color=_BEND, label="strongest lobes (share of R)")
     axes[3].plot(s, profile.opened, color=_MARK, linestyle=":", label="share of the section without a wall")
     highest = max(float(profile.harmonics[:, 1:].max()), float(profile.opened.max()), 0.1)
     axes[3].set(
-        ylabel="section", xlabel="arc length (m)", xlim=(0.0, float(s[-1])), ylim=(0.0, 1.3 * highest)
+        ylabel="shape of the section",
+        xlabel="arc length (m)",
+        xlim=(0.0, float(s[-1])),
+        ylim=(0.0, 1.3 * highest),
     )
     for panel in axes:
         panel.grid(alpha=0.25)
-        panel.legend(loc="upper right", framealpha=0.9, fontsize=8, ncols=4)
+        panel.legend(loc="upper right", framealpha=0.9, fontsize=8, ncols=3)
     return _save(figure, path)
 
 
@@ -93,18 +105,18 @@ def draw_overview(
         _draw_wall(panel, wall, i, j)
         if profile is not None:
             line = _draw_line(panel, profile, i, j, body_radius)
-        for number, opening in enumerate(openings, start=1):
-            at = (float(opening.centre[i]), float(opening.centre[j]))
-            panel.plot(*at, "o", color=_OPENING, markersize=4)
-            panel.annotate(
-                str(number), at, xytext=(6, 6), textcoords="offset points", color=_OPENING, weight="bold"
-            )
+        _draw_openings(panel, openings, i, j)
         panel.set(title=title, xlabel=across, ylabel=up)
         panel.set_aspect("equal", adjustable="datalim")
         panel.locator_params(nbins=5)
         panel.grid(alpha=0.2)
     if profile is not None:
-        figure.colorbar(line, ax=panels, label=f"room beside a drone of {body_radius:g} m (m)", shrink=0.8)
+        figure.colorbar(
+            line, ax=panels, label=f"clearance beside a drone of {body_radius:g} m (m)", shrink=0.8
+        )
+    handles, labels = panels[0].get_legend_handles_labels()
+    if labels:
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
     figure.suptitle(wall.path.name)
     return _save(figure, path)
 
@@ -166,7 +178,35 @@ def _draw_line(panel: Any, profile: Profile, i: int, j: int, body_radius: float)
     low, high = float(room.min()), float(room.max())
     line.set_clim(min(low, high - LEAST_SPAN * float(profile.radius.mean())), high)
     panel.add_collection(line)
-    panel.plot(*points[0], marker="^", color="black", markersize=6)
-    panel.plot(*points[-1], marker="s", color="black", markersize=5)
-    panel.plot(*points[profile.narrowest], marker="x", color=_MARK, markersize=7)
+    narrowest, tightest = profile.narrowest, profile.tightest
+    marks = (
+        (0, "^", "black", "start"),
+        (-1, "s", "black", "end"),
+        (narrowest, "x", _MARK, f"narrowest ({profile.arc_length[narrowest]:.4g} m along)"),
+        (tightest, "D", _TORSION, f"tightest bend ({profile.arc_length[tightest]:.4g} m along)"),
+    )
+    for place, marker, colour, label in marks:
+        panel.plot(
+            *points[place],
+            marker,
+            color=colour,
+            markersize=7,
+            fillstyle="none",
+            markeredgewidth=1.6,
+            label=label,
+        )
     return line
+
+
+def _draw_openings(panel: Any, openings: Sequence[Opening], i: int, j: int) -> None:
+    """Dots with their numbers; those that lie behind one another share a label."""
+    numbers: dict[tuple[float, float], list[str]] = {}
+    for number, opening in enumerate(openings, start=1):
+        at = (float(opening.centre[i]), float(opening.centre[j]))
+        near = next((o for o in numbers if np.hypot(o[0] - at[0], o[1] - at[1]) < opening.radius), at)
+        numbers.setdefault(near, []).append(str(number))
+        panel.plot(*at, "o", color=_OPENING, markersize=4, label="openings" if number == 1 else None)
+    for at, shared in numbers.items():
+        panel.annotate(
+            ", ".join(shared), at, xytext=(6, 6), textcoords="offset points", color=_OPENING, weight="bold"
+        )
