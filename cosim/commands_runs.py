@@ -62,19 +62,27 @@ def view(sources: tuple[Path, ...], **options: Any) -> None:
 @option(
     "--out", type=click.Path(path_type=Path), metavar="FILE.html", help="Page [default: RUN/report.html]."
 )
-def report(sources: tuple[Path, ...], out: Path | None) -> None:
+@option(
+    "--fly",
+    type=click.IntRange(min=0),
+    default=0,
+    metavar="N",
+    help="Fly an evaluation's first N failures again, and link each to its replay.",
+)
+def report(sources: tuple[Path, ...], out: Path | None, fly: int) -> None:
     """Write one HTML page with replay in 3-D, plots, timings, settings and hashes; it opens from disk.
 
-    RUN is a run folder, or the results.json of `cosim evaluate --out`. Several runs are overlaid; an evaluation's
-    failures are linked to those of their runs that are given.
+    RUN is a run folder, or the folder of `cosim evaluate --out`. Several runs are overlaid; an evaluation's failures
+    are linked to those of their runs that are given or flown again.
 
     \b
     cosim report runs/2026-...
     cosim report runs/ppo runs/pure-pursuit --out comparison.html
+    cosim report runs/evaluation --fly 20
     """
     from cosim.report import report as write
 
-    click.echo(write(sources, out))
+    click.echo(write(sources, out, fly))
 
 
 @command(short_help="Write a recorded run in another format.")
@@ -104,9 +112,10 @@ def export(run: Path, kind: str, output: Path | None) -> None:
 @command(short_help="Check a run, and replay its commands through fresh physics.")
 @click.argument("run", type=click.Path(path_type=Path))
 @option("--mesh", type=click.Path(path_type=Path), metavar="PATH", help="Where its tube is now.")
+@option("--policy", type=click.Path(path_type=Path), metavar="PATH", help="Where its policy is now.")
 @option("--server", metavar="COMMAND", help="Physics process, the rendezvous appended [default: the run's].")
 @json_option
-def verify(run: Path, mesh: Path | None, server: str | None, as_json: bool) -> None:
+def verify(run: Path, mesh: Path | None, policy: Path | None, server: str | None, as_json: bool) -> None:
     """Check that a run is whole, and that a fresh physics process makes the same poses of its commands, bit for bit.
 
     Exits 1 and names step and quantity where the data, the mesh or the policy were changed or the poses differ.
@@ -117,5 +126,5 @@ def verify(run: Path, mesh: Path | None, server: str | None, as_json: bool) -> N
     """
     from cosim.verify import verify as run_verification
 
-    if not run_verification(run, mesh=mesh, server=server, as_json=as_json):
+    if not run_verification(run, mesh=mesh, policy=policy, server=server, as_json=as_json):
         sys.exit(EXIT_NO_SUCCESS)

@@ -25,6 +25,7 @@ from cosim.folders import RESULTS
 from cosim.recording import LOG, MANIFEST
 from cosim.report_axis import whole_axis
 from cosim.report_evaluation import describe_evaluation, read_results
+from cosim.report_failures import flown_failures, fly_failures
 from cosim.report_run import Kept, describe_run
 from cosim.report_tube import describe_tube
 from cosim.runs import Run, read_run
@@ -69,12 +70,13 @@ class Arrays:
         return base64.b64encode(zlib.compress(b"".join(self._pieces), 6)).decode()
 
 
-def report(sources: Sequence[Path], out: Path | None = None) -> Path:
+def report(sources: Sequence[Path], out: Path | None = None, fly: int = 0) -> Path:
     """Write the page of runs and evaluations.
 
     Args:
         sources: run folders, and `results.json` of `cosim evaluate --out` or the folder that it is in.
         out: the page; None for report.html in the first folder.
+        fly: failures of each evaluation that are flown again first; those that were before are shown anyway.
 
     Returns:
         The page.
@@ -83,8 +85,16 @@ def report(sources: Sequence[Path], out: Path | None = None) -> Path:
         RunError: a source is neither, or a run holds no record.
         OutputError: the page cannot be written.
     """
-    results = [path for source in sources if (path := _results_in(source)) is not None]
-    runs = [read_run(source) for source in sources if _results_in(source) is None]
+    results = {path: read_results(path) for source in sources if (path := _results_in(source)) is not None}
+    if fly and not results:
+        raise RunError(
+            "--fly: expected results of `cosim evaluate --out`, found runs alone: nothing to fly again"
+        )
+    for path, found in results.items():
+        fly_failures(path, found, fly)
+    again = [folder for path, found in results.items() for folder in flown_failures(path, found)]
+    given = [source for source in sources if _results_in(source) is None]
+    runs = [read_run(folder) for folder in dict.fromkeys((*given, *again))]
     for run in runs:
         if not len(run.records):
             raise RunError(
@@ -96,7 +106,7 @@ def report(sources: Sequence[Path], out: Path | None = None) -> Path:
         raise OutputError(f"{target}: expected the name of a page, found that of the data")
     arrays = Arrays()
     described, tubes = _describe(runs, arrays)
-    evaluations = [describe_evaluation(path, read_results(path), runs) for path in results]
+    evaluations = [describe_evaluation(path, found, runs) for path, found in results.items()]
     data = {
         "made": {"cosim": __version__, "at": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())},
         "runs": described,

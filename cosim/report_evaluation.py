@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,7 @@ def describe_evaluation(path: Path, results: Mapping[str, Any], runs: Sequence[R
     flown = results["flown"]
     failures = [episode for episode in flown if episode["outcome"] != "success"]
     return {
-        "path": str(path),
+        "folder": shlex.quote(str(path.parent)),
         "heading": list(heading(results)),
         "legend": list(legend(results)),
         "rows": results["rows"],

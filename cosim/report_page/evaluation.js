@@ -73,6 +73,7 @@ function failuresOf(evaluation, runs, onFocus) {
     make(
       "tr",
       {},
+      make("td", {}, replayOf(failure, runs, onFocus)),
       make("td", {}, failure.policy),
       make("td", { class: "number" }, `${failure.level}`),
       make("td", { class: "number" }, `${failure.seed}`),
@@ -80,7 +81,7 @@ function failuresOf(evaluation, runs, onFocus) {
       make("td", { class: "number" }, `${failure.steps}`),
       make("td", { class: "number" }, percent(failure.progress)),
       make("td", { class: "number" }, `${fixed(failure.min_clearance_m, 3)} m`),
-      make("td", {}, replayOf(failure, runs, onFocus)),
+      make("td", {}, commandOf(failure)),
     ),
   );
   const hidden = body.slice(SHOWN_FAILURES);
@@ -104,30 +105,37 @@ function failuresOf(evaluation, runs, onFocus) {
       )
     : null;
   const repeats = failures[0].repeats ? "which repeats it bit for bit" : "in another world than the evaluation’s";
+  const linked = failures.filter((failure) => failure.run !== null).length || "None";
   return [
     make("h2", {}, `Failures: ${failures.length} of ${evaluation.episodes} episodes`),
     make(
       "p",
       { class: "small" },
-      `A failure is flown again by its command, ${repeats}; give its run folder to this report as well to see its replay here.`,
+      `${linked} of them have their replay here. A failure is flown again by its command, ${repeats}; `,
+      make("code", {}, `cosim report ${evaluation.folder} --fly ${Math.min(failures.length, SHOWN_FAILURES)}`),
+      " does so and links the replays.",
     ),
-    table(["pilot", ">level", ">seed", "outcome", ">steps", ">progress", ">smallest gap", "replay"], body),
+    table(["replay", "pilot", ">level", ">seed", "outcome", ">steps", ">progress", ">smallest gap", "flown again by"], body),
     ...(more ? [more] : []),
   ];
 }
 
-/** A link to the replay of a failure where its run is on the page, and the command that flies it again. */
-function replayOf(failure, runs, onFocus) {
+/** The command that flies a failure again. */
+function commandOf(failure) {
   const code = make("code", {}, failure.launch);
   const copy = make(
     "button",
     { type: "button", class: "plain", "aria-label": "Copy the command", onclick: () => copyText(code, copy) },
     "copy",
   );
-  const command = make("div", { class: "command" }, code, copy);
-  if (failure.run === null) return command;
+  return make("div", { class: "command" }, code, copy);
+}
+
+/** A link to the replay of a failure where its run is on the page. */
+function replayOf(failure, runs, onFocus) {
+  if (failure.run === null) return "–";
   const run = runs[failure.run];
-  const link = make(
+  return make(
     "a",
     {
       href: `#run=${run.number}`,
@@ -138,7 +146,6 @@ function replayOf(failure, runs, onFocus) {
     },
     "replay",
   );
-  return make("div", {}, link, command);
 }
 
 /** Copy, or at least select: pages from disk may not reach the clipboard everywhere. */

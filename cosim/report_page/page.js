@@ -288,7 +288,7 @@ class Report {
     if (this.many) entries.unshift(["run", run.label]);
     this.dial.place(run, i);
     byId("readout").replaceChildren(
-      ...entries.map(([name, value]) => make("div", {}, make("dt", {}, name), make("dd", {}, value))),
+      ...entries.map(([name, value]) => make("div", { class: name }, make("dt", {}, name), make("dd", {}, value))),
     );
   }
 
