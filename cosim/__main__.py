@@ -14,7 +14,7 @@ from types import FrameType
 def main() -> None:
     """Import the command and run it."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _leave_at_once)
+        signal.signal(number, _leave_at_once)  # a hangup does so by itself
     from cosim.cli import main as run  # it has handlers of its own
 
     run()

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import traceback
-from types import FrameType
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from typing import Any, Final
 
 import click
@@ -19,25 +19,23 @@ from cosim import (
     commands_training,
     interrupts,
 )
-from cosim.errors import INTERNAL, Terminated, exit_status
+from cosim.errors import INTERNAL, SIGNALLED, exit_status
 
 CONTEXT: Final = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 
 
 class _Commands(click.Group):
-    """All the commands, in the order in which they were added.
+    """All the commands, in the order in which they were added."""
 
-    Where nobody reads their output any more they end as SIGPIPE would end them.
-    """
+    def make_context(self, *arguments: Any, **named: Any) -> click.Context:
+        """Parse what precedes a command; --help and --version write here."""
+        with _unread_output():
+            return super().make_context(*arguments, **named)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command. Of a closed pipe click would make 1, which means "no success" here."""
-        try:
+        """Run a command."""
+        with _unread_output():
             return super().invoke(ctx)
-        except BrokenPipeError as error:
-            # Python flushes once more at its exit.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            sys.exit(exit_status(error))
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Names as they are listed."""
@@ -76,37 +74,69 @@ for _command in (
     cosim.add_command(_command)
 
 
-def _interrupted(number: int, _frame: FrameType | None) -> None:
-    """Ctrl-C or SIGTERM: the first one ends the command in order, and another must not cut the cleaning up short."""
-    for deaf_to in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(deaf_to, signal.SIG_IGN)
-    error = KeyboardInterrupt if number == signal.SIGINT else Terminated
-    interrupts.remember(error)
-    raise error
-
-
 def main() -> None:
     """Entry point of the console script; every error raised on purpose is one sentence on stderr."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _interrupted)
+    interrupts.listen()
+    try:
+        status = _run()
+    finally:
+        interrupts.ignore()
+    sys.exit(status)
+
+
+def _run() -> int:
+    """Run the command that was asked for, and return its exit status."""
     try:
         cosim.main(prog_name="cosim", standalone_mode=False)
-    except click.exceptions.Exit as done:
-        sys.exit(done.exit_code)
-    except click.Abort:
-        sys.exit(exit_status(KeyboardInterrupt()))
     except click.ClickException as error:
-        error.show()
-        sys.exit(error.exit_code)
+        with suppress(OSError):  # nobody can be told
+            error.show()
+        return error.exit_code
     except SystemExit:
         raise
     except BaseException as error:  # noqa: BLE001  exit statuses are given here and nowhere else
-        status = exit_status(error)
-        if status is None:
-            traceback.print_exc()
+        return _tell(error)
+    return 0
+
+
+def _tell(error: BaseException) -> int:
+    """Say on stderr what was wrong, and return the exit status."""
+    if isinstance(error, click.Abort):  # click's word for Ctrl-C, and for the end of a pipe
+        error = error.__cause__ or KeyboardInterrupt()
+    status, signal_number = exit_status(error), interrupts.pending()
+    with suppress(OSError):  # nobody can be told
+        if status is not None:
+            _say(error)
+        elif signal_number is None:  # else a library failed in a way of its own of being interrupted
+            traceback.print_exception(error)
             click.echo(f"cosim: a fault of cosim itself ({type(error).__name__}); please report it", err=True)
-            sys.exit(INTERNAL)
-        for line in (f"cosim: {error}" if str(error) else "", *getattr(error, "__notes__", ())):
-            if line:
-                click.echo(line, err=True)
-        sys.exit(status)
+    if signal_number is not None:
+        return SIGNALLED + signal_number
+    return INTERNAL if status is None else status
+
+
+def _say(error: BaseException) -> None:
+    """One sentence, and the notes that were added to it."""
+    text = str(error)
+    if isinstance(error, OSError):
+        text = f"{error.filename or 'the output'} cannot be written: {error.strerror}"
+        _leave_stdout()
+    for line in (f"cosim: {text}" if text else "", *getattr(error, "__notes__", ())):
+        if line:
+            click.echo(line, err=True)
+
+
+@contextmanager
+def _unread_output() -> Iterator[None]:
+    """End as SIGPIPE would where nobody reads the output any more; click would make 1 of it: "no success" here."""
+    try:
+        yield
+    except BrokenPipeError as error:
+        _leave_stdout()
+        sys.exit(exit_status(error))
+
+
+def _leave_stdout() -> None:
+    """Forget what could not be written to stdout: Python would try once more at its exit, and complain."""
+    if sys.stdout is not None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -11,21 +11,29 @@
     ├── protocol.errors.SessionError    2   our own side asked for what cannot be had (no room, name in use)
     meshes.errors.MeshError         2   the tube cannot be read
     agent_client.errors.AgentError  2   policy, contract or settings do not fit
+    OSError                         2   of a disk that is full or cannot be written
 
 `protocol` and `meshes` import nothing of ours, so each package has one root; this table joins them.
 """
 
 from __future__ import annotations
 
+import errno
 from typing import Final
 
 USAGE: Final = 2
 PEER: Final = 3
 INTERNAL: Final = 70
 """A fault of our own: 1 means "no success" and nothing else."""
-BROKEN_PIPE: Final = 141
-INTERRUPTED: Final = 130
-TERMINATED: Final = 143
+SIGNALLED: Final = 128
+"""Of a signal, beside its number: what a shell makes of it."""
+HUNG_UP: Final = SIGNALLED + 1
+INTERRUPTED: Final = SIGNALLED + 2
+BROKEN_PIPE: Final = SIGNALLED + 13
+TERMINATED: Final = SIGNALLED + 15
+
+_DISK: Final = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
+"""Of the operating system's errors, those that no check beforehand finds."""
 
 
 class CosimError(Exception):
@@ -67,6 +75,10 @@ class Terminated(BaseException):
     """SIGTERM arrived; handled like Ctrl-C, so that both processes end and the recording is saved."""
 
 
+class HungUp(Terminated):
+    """SIGHUP arrived: the terminal was closed."""
+
+
 def exit_status(error: BaseException) -> int | None:
     """Exit status for an error, or None for one that nobody raised on purpose."""
     from agent_client.errors import AgentError
@@ -77,6 +89,8 @@ def exit_status(error: BaseException) -> int | None:
         return INTERRUPTED
     if isinstance(error, BrokenPipeError):
         return BROKEN_PIPE
+    if isinstance(error, HungUp):
+        return HUNG_UP
     if isinstance(error, Terminated):
         return TERMINATED
     if isinstance(error, WorkerError):
@@ -85,4 +99,6 @@ def exit_status(error: BaseException) -> int | None:
         return USAGE
     if isinstance(error, ProtocolError):
         return PEER
+    if isinstance(error, OSError) and error.errno in _DISK:
+        return USAGE
     return None

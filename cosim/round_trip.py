@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import socket
 import statistics
 import struct
@@ -18,6 +19,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
@@ -234,7 +236,7 @@ def _pipe_peer(connection: Connection) -> None:
         try:
             while True:
                 connection.send_bytes(POSE.pack(*COMMAND.unpack(connection.recv_bytes()), *ZEROS))
-        except EOFError:
+        except (EOFError, ConnectionError):
             return
 
 
@@ -279,9 +281,17 @@ def _udp_peer(ours: socket.socket) -> None:
 
 @contextmanager
 def child(target: Callable[..., None], *arguments: Any, patience: float = 0.2) -> Iterator[None]:
-    """A second process, which is expected to end by itself, and is made to if it does not."""
+    """A second process, which is expected to end by itself, and is made to if it does not.
+
+    It never sees Ctrl-C, which reaches all processes of a terminal: ending it is left to us.
+    """
     process = multiprocessing.get_context("spawn").Process(target=target, args=arguments, daemon=True)
-    process.start()
+    resource_tracker.ensure_running()  # starting it would unblock the signal
+    usual = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, usual)
     try:
         yield
     finally:

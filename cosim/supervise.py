@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -15,6 +16,7 @@ from types import TracebackType
 from typing import IO, Final, Self
 
 import protocol
+from cosim import interrupts
 from cosim.errors import OutputError, PeerCommandError
 from protocol.liveness import describe_exit
 
@@ -22,6 +24,8 @@ GOODBYE_SECONDS: Final = 5.0
 """How long a server may take to leave after the session's goodbye, before it is terminated."""
 TERMINATE_SECONDS: Final = 2.0
 """How long it may take to end when it is terminated, before it is killed."""
+LOOK_SECONDS: Final = 0.1
+"""Between two looks at whether somebody became impatient."""
 
 LOGS: Final = ("physics.stdout.log", "physics.stderr.log")
 
@@ -92,14 +96,21 @@ class PhysicsProcess:
     def stop(self, patience: float) -> None:
         """Wait for the process to leave; terminate it, then kill its whole group, when it does not."""
         try:
-            self._process.wait(patience)
-        except subprocess.TimeoutExpired:
-            self._signal(signal.SIGTERM)
-            with suppress(subprocess.TimeoutExpired):  # then it is killed, with whatever it started itself
-                self._process.wait(TERMINATE_SECONDS)
+            if not self._leaves(patience):
+                self._signal(signal.SIGTERM)
+                self._leaves(TERMINATE_SECONDS)
         finally:
-            self._signal(signal.SIGKILL)
+            self._signal(signal.SIGKILL)  # with whatever it started itself
             self._process.wait()
+
+    def _leaves(self, patience: float) -> bool:
+        """Whether the process ends within a time (s); nobody waits for it once Ctrl-C was pressed again."""
+        until = time.monotonic() + patience
+        while not interrupts.hurried() and (left := until - time.monotonic()) > 0.0:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(min(left, LOOK_SECONDS))
+                return True
+        return self._process.poll() is not None
 
     def _signal(self, number: signal.Signals) -> None:
         """Send a signal to the process and all that it started."""

@@ -323,7 +323,8 @@ def _begin(folder: str) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, leave)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, leave)
     atexit.register(worker.close)
     threading.Thread(target=follow_parent, daemon=True).start()
 

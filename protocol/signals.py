@@ -9,12 +9,15 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, Final
 
-_HELD: Final = (signal.SIGINT, signal.SIGTERM)
+_HELD: Final = tuple(
+    signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
+"""Those that a user or a closed terminal ends a program with; Windows has no hangup."""
 
 
 @contextmanager
 def held_signals() -> Iterator[None]:
-    """Hold SIGINT and SIGTERM back; those that came are delivered at the end, out of the `with` statement.
+    """Hold SIGINT, SIGTERM and SIGHUP back; those that came are delivered at the end, out of the `with` statement.
 
     Only signals that a Python handler takes are held: the others end the process, or nothing, at once. Outside of
     the main thread it does nothing, since Python runs handlers in the main thread alone. A mask of the thread

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -63,6 +64,27 @@ def test_the_version_is_told() -> None:
     """`cosim --version` names program and version."""
     done = run_here("--version")
     assert (done.status, done.stdout.strip()) == (0, f"cosim, version {__version__}")
+
+
+def test_output_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    """A full disk under stdout is one sentence and status 2; a pipe that nobody reads ends as by SIGPIPE."""
+    here = {
+        "cwd": tmp_path,
+        "env": environment(),
+        "timeout": DEADLINE,
+        "stderr": subprocess.PIPE,
+        "text": True,
+    }
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command("--version"), check=False, stdout=full, **here)
+    assert (done.returncode, done.stderr) == (
+        2, "cosim: the output cannot be written: No space left on device\n",
+    )  # fmt: skip
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as unread:
+        done = subprocess.run(command("--version"), check=False, stdout=unread, **here)
+    assert (done.returncode, done.stderr) == (141, "")
 
 
 def test_help_waits_for_no_heavy_import(tmp_path: Path) -> None:

@@ -32,6 +32,40 @@ sys.meta_path.insert(0, Slow())
 main()
 """
 
+LISTENING = """
+import ctypes, signal, time
+from cosim import interrupts
+interrupts.listen()
+press = lambda: signal.raise_signal(signal.SIGINT)
+"""
+CLEANING = """
+try:
+    try:
+        press()
+    finally:
+        press()
+        print("cleaned", interrupts.hurried())
+except KeyboardInterrupt:
+    print("ended")
+"""
+SWALLOWED = """
+try:
+    press()
+except BaseException:
+    print("swallowed", interrupts.hurried())
+try:
+    press()
+except KeyboardInterrupt:
+    print("ended", interrupts.hurried())
+"""
+SWALLOWED_IN_A_CALLBACK = """
+try:
+    ctypes.CFUNCTYPE(None)(press)()
+    time.sleep(60)
+except KeyboardInterrupt:
+    print("ended")
+"""
+
 
 def start(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
     """Start `cosim`, for which Ctrl-C is not ignored as it is for a shell's jobs in the background."""
@@ -88,15 +122,39 @@ def test_ctrl_c_while_the_command_is_imported_is_quiet(number: signal.Signals) -
     assert (done.status, done.stderr) == (128 + number, "")
 
 
+@pytest.mark.parametrize(
+    ("code", "said", "told"),
+    [
+        (CLEANING, "cleaned True\nended\n", "cosim: ending, a moment\n"),
+        (SWALLOWED, "swallowed False\nended False\n", ""),
+        (SWALLOWED_IN_A_CALLBACK, "ended\n", ""),
+    ],
+    ids=["cleaning", "swallowed", "callback"],
+)
+def test_ctrl_c_is_neither_lost_nor_cuts_cleaning_short(code: str, said: str, told: str) -> None:
+    """Pressed again while the first is answered it hurries; where the first was swallowed it is raised again."""
+    done = finish(
+        subprocess.Popen(
+            [sys.executable, "-c", LISTENING + code],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT,
+        )
+    )  # fmt: skip
+    assert (done.status, done.stdout, done.stderr) == (0, said, told)
+
+
 def test_ctrl_c_at_any_moment_of_the_start_leaves_nothing(session_name: str, tmp_path: Path) -> None:
-    """Between the first import and the first step: status 130, no traceback, no process, no segment, no folder."""
-    for moment in (0.15, 0.35, 0.55, 0.8):
+    """Between the first import and the first step: status 130, no traceback, no process, no segment, no folder.
+
+    Nor does a terminal that is closed leave anything.
+    """
+    interrupt, hangup = signal.SIGINT, signal.SIGHUP
+    for moment, number in ((0.15, interrupt), (0.35, hangup), (0.55, interrupt), (0.8, hangup)):
         process = start("launch", "--session", session_name, "--realtime", "1", cwd=tmp_path)
         time.sleep(moment)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         done = finish(process)
         # Before our first line the interpreter itself ends by the signal, of which a shell makes 130 too.
-        assert done.status in (130, -signal.SIGINT), done
+        assert done.status in (128 + number, -number), done
         assert "Traceback" not in done.stderr
         assert leftovers(session_name) == []
         assert processes_with(session_name) == []
