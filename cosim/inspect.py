@@ -71,6 +71,10 @@ def inspect(options: InspectOptions, *, as_json: bool) -> dict[str, Any]:
         _report_refusal(options, error, as_json)
         remove_empty(made)
         raise
+    if options.out is not None and tube.found is not None and _centreline_in(options.out, tube).exists():
+        raise OutputError(
+            f"--out {options.out}: expected a folder without {_centreline_in(options.out, tube).name}, found one"
+        )
     refused: MeshError | None = None
     with working("inspecting"):
         profile, construction = measure_profile(tube), examine(tube)
@@ -153,9 +157,7 @@ def _write(
 
     written = []
     if tube.found is not None:
-        path = folder / f"{tube.path.stem}_centerline.obj"
-        if path.exists():
-            raise OutputError(f"--out {folder}: expected a folder without {path.name}, found one")
+        path = _centreline_in(folder, tube)
         try:
             write_centreline_obj(path, tube.wall.to_file(tube.found.points), digits=17)
         except OSError as error:
@@ -166,6 +168,11 @@ def _write(
         draw_overview(folder / OVERVIEW, tube.wall, profile, construction.openings, body_radius),
         *written,
     ]
+
+
+def _centreline_in(folder: Path, tube: Tube) -> Path:
+    """As it is looked for beside the mesh."""
+    return folder / f"{tube.path.stem}_centerline.obj"
 
 
 def _write_report(folder: Path, report: dict[str, Any], files: list[Path]) -> None:

@@ -17,7 +17,9 @@ from tubular import Mesh, circle, cut, extrude, in_tube, join, junction, line, r
 from agent_client.flight import FlightResult, fly
 from agent_client.task import Outcome
 from cosim.pilots import Terms, choose_pilot, read_pilot
+from cosim.runs import read_run
 from cosim.sessions import server_session
+from cosim.verify import find_tube
 from meshes.errors import MeshError
 from meshes.formats import AxesChoice
 from meshes.mesh_geometry import MeshGeometry
@@ -182,12 +184,25 @@ def test_a_found_centreline_makes_a_whole_run(fly: Callable[..., Done], tmp_path
 
 
 def test_a_gltf_file_is_flown_in_its_own_axes(fly: Callable[..., Done], tmp_path: Path) -> None:
-    """The up-axis that the format states is followed, said, and handed on to physics."""
-    done = fly("--mesh", str(write(wavy(), tmp_path / "tube.glb")), "--max-steps", "3")
+    """The up-axis that the format states is followed, said, and handed on to physics; the file with the vertices
+    belongs to the mesh, and is missed where it is another."""
+    mesh = tmp_path / "tube.gltf"
+    for name, content in trimesh.Trimesh(*wavy(), process=False).export(file_type="gltf").items():
+        (mesh if name == "model.gltf" else tmp_path / name).write_bytes(content)
+    done = fly("--mesh", str(mesh), "--max-steps", "3")
     assert (done.status, done.report["outcome"]) == (0, "timeout"), done.stderr
     described = manifest_of(tmp_path / "run")["mesh"]
     assert (described["axes"], described["scale"]) == ("yup", 1.0)
     assert "axes: Y up, as glTF" in done.stderr
+
+    assert find_tube(read_run(tmp_path / "run"), None)[1] == []
+    name = next(iter(described["companions"]))
+    buffer = bytearray((tmp_path / name).read_bytes())
+    buffer[40] ^= 1
+    (tmp_path / name).write_bytes(buffer)
+    reference, findings = find_tube(read_run(tmp_path / "run"), None)
+    assert reference is None
+    assert [name in finding.what for finding in findings] == [True]
 
 
 def test_a_collada_file_is_flown_in_its_own_unit(fly: Callable[..., Done], tmp_path: Path) -> None:
