@@ -10,15 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.cameras import INSIDE_BACK, Camera, follow, inside, overview
-from cosim.drone_figure import DroneFigure, Sighting, arrow, frame_along
+from cosim.drone_figure import KEY as SENSES_KEY
+from cosim.drone_figure import DroneFigure, arrow, frame_along
 from cosim.film import write_picture
-from cosim.playback import AXIS_COLOUR, DRONE_COLOUR, PATH_WIDTH, RIM_COLOUR, RUN_COLOURS, VIEWS, WALL_COLOUR
-from cosim.report_tube import simplify
+from cosim.live_senses import LiveSenses, Sensed
+from cosim.playback import AXIS_COLOUR, DRONE_COLOUR, PATH_WIDTH, RUN_COLOURS, VIEWS, put_up_tube
+from cosim.scales import scale_of
 from cosim.scene import Surface
 from cosim.senses import local_frames
 from cosim.view import open_stage
 from cosim.view_window import NAP_S, QUIT
-from cosim.winding import face_outwards
 from meshes.tube import read_tube
 
 if TYPE_CHECKING:
@@ -30,7 +31,14 @@ Floats = NDArray[np.float64]
 
 SIZE: Final = (960, 600)
 FRAME_SIZE: Final = (480, 320)
-COMMAND_COLOUR: Final = "#12a150"
+COMMAND_COLOUR: Final = "#d81b8c"
+KEY: Final = (
+    ("centreline", AXIS_COLOUR),
+    ("command", COMMAND_COLOUR),
+    *SENSES_KEY,
+)
+"""What the colours mean."""
+HELP: Final = "c camera   q close: the flight goes on   its way goes through the poses that were seen"
 TRIANGLES: Final = 60_000
 """Of the wall that is drawn at most; rays are computed with all of them."""
 TRAIL_POINTS: Final = 1500
@@ -57,51 +65,56 @@ class LiveScene:
         tube = read_tube(what.mesh, what.centreline, what.axes, what.scale, what.start_end)  # type: ignore[arg-type]
         self._tube = tube
         surface = Surface(tube.wall.vertices, tube.wall.faces)
-        if len(surface.faces) > TRIANGLES:
-            surface = simplify(surface, TRIANGLES)
-        stage.wall(face_outwards(surface, tube.axis), WALL_COLOUR, cut=True, ghost=0.0)
-        stage.rims(surface, RIM_COLOUR)
-        stage.lines([tube.axis], AXIS_COLOUR, 2.0)
+        put_up_tube(stage, surface, tube.axis, TRIANGLES, ghost=0.0)
         self._drone = DroneFigure(
             stage, what.sensors, tube.wall.scene, body_radius=what.body_radius, colour=DRONE_COLOUR
         )
         self._command = stage.surface(arrow(), COMMAND_COLOUR)
         self._trail = stage.lines([np.zeros((TRAIL_POINTS, 3))], RUN_COLOURS[0], PATH_WIDTH)
-        self._way: list[Floats] = []
-        self._say = stage.text("waiting for the first pose", "top-left")
+        self._scale = scale_of("clearance", 0.0, float(np.median(tube.radius)) - what.body_radius)
+        stage.scale(self._scale)
+        self._senses = LiveSenses(tube, what.sensors, what.memory_steps, what.body_radius)
+        self._sensed: Sensed | None = None
+        """At the pose that was seen last."""
+        self._seen = -1
+        self._way: list[tuple[Floats, float]] = []
+        """Places where the drone was seen, and the gap there (m)."""
+        stage.legend(KEY)
+        self._say = stage.text("waiting for the first pose", "top-left", size=0.8)
         self._overview = overview(surface.vertices, size[0] / size[1])
         self._view = VIEWS.index("follow")
-        self._seen = -1
+        self._drawn = -1
         self.open = True
         stage.look(self._overview)
         if self._frames is None:
             stage.on_key(self._press)
-            stage.text("c camera   q close: the flight goes on", "bottom-left", size=0.6)
+            stage.text(HELP, "bottom-left", size=0.6)
 
     def draw(self, observer: Observer) -> None:
         """Draw the newest pose, if it was not drawn yet."""
-        snapshot = observer.latest()
-        if snapshot is not None and snapshot.number != self._seen:
-            self._seen = snapshot.number
-            if np.any(snapshot.poses.quaternion[0]):  # else the lane was not reset yet
-                self._show(snapshot, observer)
+        snapshot = self._look(observer)
+        if snapshot is not None and snapshot.number != self._drawn:
+            self._drawn = snapshot.number
+            if self._sensed is not None:
+                self._show(snapshot, self._sensed, observer)
         if self._frames is None:
             self._stage.draw()
         elif snapshot is not None:
             picture = self._stage.picture()
             write_picture(self._frames / f"frame-{snapshot.step:06d}.png", picture, quickly=True)
 
-    def wait(self, until: float) -> None:
-        """Answer to mouse and keys until a time of the monotonic clock (s)."""
+    def wait(self, until: float, observer: Observer) -> None:
+        """Answer to mouse and keys until a time of the monotonic clock (s); its way goes through every pose seen."""
         while self.open and (left := until - time.monotonic()) > 0.0:
             if self._frames is None and not self._stage.pump():
                 self.open = False
+            self._look(observer)
             time.sleep(min(NAP_S, left))
 
-    def linger(self, seconds: float) -> None:
+    def linger(self, seconds: float, observer: Observer) -> None:
         """Leave the last picture for a while, or until the window is closed."""
         if self._frames is None:
-            self.wait(time.monotonic() + seconds)
+            self.wait(time.monotonic() + seconds, observer)
 
     def close(self) -> None:
         """Take it down."""
@@ -115,10 +128,24 @@ class LiveScene:
             if VIEWS[self._view] == "overview":
                 self._stage.look(self._overview)
 
-    def _show(self, snapshot: Snapshot, observer: Observer) -> None:
+    def _look(self, observer: Observer) -> Snapshot | None:
+        """The newest pose; what is sensed there is worked out, and the way goes on to it."""
+        snapshot = observer.latest()
+        if snapshot is not None and snapshot.number != self._seen and _has_pose(snapshot):
+            self._seen = snapshot.number
+            position, quaternion = snapshot.poses.position[0].copy(), snapshot.poses.quaternion[0]
+            sensed = self._sensed = self._senses.sense(snapshot.step, position, quaternion)
+            way = self._way
+            if not way or np.linalg.norm(position - way[-1][0]) > 0.02:
+                way.append((position, sensed.gap))
+            if len(way) > TRAIL_POINTS:
+                del way[1:-1:2]
+        return snapshot
+
+    def _show(self, snapshot: Snapshot, sensed: Sensed, observer: Observer) -> None:
         poses = snapshot.poses
         position, quaternion = poses.position[0], poses.quaternion[0]
-        self._drone.show(position, quaternion, None, Sighting(None, None))
+        self._drone.show(position, quaternion, None, sensed.sighting)
         request = observer.request()
         direction = np.zeros(3) if request is None else request.commands.direction[0]
         speed = 0.0 if request is None else float(request.commands.speed[0])
@@ -126,29 +153,21 @@ class LiveScene:
         if speed > 0.0 and np.any(direction):
             length = 4.0 * speed * self._body_radius
             self._command.place(position, length * frame_along(direction / np.linalg.norm(direction)))
-        self._show_trail(position)
-        tube = self._tube
-        i = int(np.argmin(np.linalg.norm(tube.axis - position, axis=1)))
-        self._say(self._words(snapshot, float(tube.arc_length[i]), speed))
+        way = self._way + [self._way[-1]] * (TRAIL_POINTS - len(self._way))
+        self._trail.move(np.array([place for place, _ in way]))
+        self._trail.shade(np.array([gap for _, gap in way]), self._scale)
+        self._say(self._words(snapshot, sensed, speed))
         if VIEWS[self._view] != "overview":
-            self._stage.look(self._camera(i, poses))
+            self._stage.look(self._camera(round(sensed.along / self._tube.step), poses))
 
-    def _words(self, snapshot: Snapshot, along: float, commanded: float) -> str:
+    def _words(self, snapshot: Snapshot, sensed: Sensed, commanded: float) -> str:
         poses, length = snapshot.poses, self._tube.length
         moving = float(np.linalg.norm(poses.linear_velocity[0]))
         touched = "   CONTACT" if poses.contact_steps[0] else ""
         return (
-            f"LIVE   step {snapshot.step}   {poses.sim_time[0]:.1f} s   {100.0 * along / length:.1f} % of "
-            f"{length:.1f} m\n{moving:.2f} m/s   commanded {commanded:.2f} m/s{touched}"
+            f"LIVE   step {snapshot.step}   {poses.sim_time[0]:.1f} s   {100.0 * sensed.along / length:.1f} % of "
+            f"{length:.1f} m\n{moving:.2f} m/s   commanded {commanded:.2f} m/s   gap {sensed.gap:.2f} m{touched}"
         )
-
-    def _show_trail(self, position: Floats) -> None:
-        way = self._way
-        if not way or np.linalg.norm(position - way[-1]) > 0.02:
-            way.append(position.copy())
-        if len(way) > TRAIL_POINTS:
-            del way[1:-1:2]
-        self._trail.move(np.array(way + [way[-1]] * (TRAIL_POINTS - len(way))))
 
     def _camera(self, i: int, poses: PoseBatch) -> Camera:
         tube, position = self._tube, poses.position[0]
@@ -159,3 +178,8 @@ class LiveScene:
         behind = tube.axis[max(i - round(back / tube.step), 0)]
         up = local_frames(poses.position, poses.quaternion)[0, 1]
         return inside(position, behind, tangent, up, radius)
+
+
+def _has_pose(snapshot: Snapshot) -> bool:
+    """Whether the lane was reset: before that its words are zero."""
+    return bool(np.any(snapshot.poses.quaternion[0]))

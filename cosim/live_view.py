@@ -1,8 +1,8 @@
 """`cosim launch --view`: a live window in a process of its own, which looks on at the session and touches nothing.
 
-Poses and commands are on the wire, and shown as they are. LiDAR rays and the camera's field are computed here from
-the mesh, without the sensors' noise; target, memory and reward are the agent's alone, and left out: `cosim view`
-shows them afterwards.
+Poses and commands are on the wire, and shown as they are. LiDAR rays, the camera's field, target, memory and the gap
+to the wall are computed here from the mesh, at the poses that it sees, without the sensors' noise: `cosim view` shows
+afterwards what the agent had of them.
 """
 
 from __future__ import annotations
@@ -62,6 +62,8 @@ class Watched:
     scale: float
     start_end: str
     sensors: Sensors
+    memory_steps: int
+    """Control steps for which the direction of a target that is no longer seen is remembered."""
     body_radius: float
     """(m)"""
     frames: str | None = None
@@ -111,6 +113,7 @@ class LiveView:
             scale=described["scale"],
             start_end=start_end,
             sensors=Sensors.of_settings(settings, field_of_view),
+            memory_steps=settings.memory.steps,
             body_radius=settings.drone.body_radius,
             frames=None if frames is None else str(frames.resolve()),
         )
@@ -239,7 +242,7 @@ def _look_on(scene: Any, observer: Any) -> None:
             if ended:
                 break
             due = max(due + 1.0 / FRAMES_PER_S, time.monotonic())
-        scene.wait(due)
+        scene.wait(due, observer)
     else:
         return
-    scene.linger(LINGER_S)
+    scene.linger(LINGER_S, observer)

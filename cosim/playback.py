@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from cosim.cameras import INSIDE_BACK, Camera, follow, inside, overview
 from cosim.drone_figure import KEY, DroneFigure, Sighting
 from cosim.report_tube import simplify
+from cosim.scales import Quantity, scale_of
 from cosim.scene import Surface
 from cosim.senses import local_frames
-from cosim.tracks import MAPS, TITLES, Quantity, Track
+from cosim.tracks import Track
 from cosim.winding import face_outwards
 from meshes.embree import RayScene
 
@@ -138,23 +139,19 @@ class Playback:
         share = 0.02 if quantity == "reward" else 0.0
         low = min((float(np.quantile(v, share)) for v in values), default=0.0)
         high = max((float(np.quantile(v, 1.0 - share)) for v in values), default=1.0)
+        scale = None
+        if quantity is not None:
+            scale = scale_of(quantity, low, high)
+            self._stage.scale(scale)
         for i, track in enumerate(self._tracks):
             stride = max(1, -(-len(track.scene.positions) // MOST_POINTS))
             points = _moving(track.scene.positions[::stride])
             if points is None:
                 continue
             path, kept = points
-            if quantity is None:
-                self._stage.lines([path], own[i], PATH_WIDTH)
-                continue
-            self._stage.scaled_line(
-                path,
-                values[i][::stride][kept],
-                width=PATH_WIDTH,
-                colours=MAPS[quantity],
-                limits=(low, max(high, low + 1e-9)),
-                title=TITLES[quantity] if i == 0 else "",
-            )
+            line = self._stage.lines([path], own[i], PATH_WIDTH)
+            if scale is not None:
+                line.shade(values[i][::stride][kept], scale)
 
 
 def _put_up(stage: Stage, tracks: Sequence[Track]) -> dict[int, RayScene]:
@@ -167,12 +164,28 @@ def _put_up(stage: Stage, tracks: Sequence[Track]) -> dict[int, RayScene]:
         if same is None:
             same = RayScene(tube.vertices, tube.faces)
             shown.append((tube, same))
-            drawn = simplify(tube, TRIANGLES) if len(tube.faces) > TRIANGLES else tube
-            stage.wall(face_outwards(drawn, track.centreline), WALL_COLOUR, cut=True)
-            stage.rims(drawn, RIM_COLOUR)
-            stage.lines([track.centreline], AXIS_COLOUR, 2.0)
+            put_up_tube(stage, tube, track.centreline, TRIANGLES)
         walls[id(tube)] = same
     return walls
+
+
+def put_up_tube(stage: Stage, tube: Surface, axis: Floats, most: int, ghost: float = 0.1) -> None:
+    """Put up a wall, cut open, and its axis (M, 3); of more than `most` triangles a simpler wall, which says so.
+
+    Raises:
+        CosimError: it must be simplified, and the library for that is not installed.
+    """
+    drawn = tube
+    if len(tube.faces) > most:
+        drawn = simplify(tube, most)
+        stage.text(
+            f"wall drawn with {len(drawn.faces):,} of its {len(tube.faces):,} triangles",
+            "bottom-right",
+            size=0.6,
+        )
+    stage.wall(face_outwards(drawn, axis), WALL_COLOUR, cut=True, ghost=ghost)
+    stage.rims(drawn, RIM_COLOUR)
+    stage.lines([axis], AXIS_COLOUR, 2.0)
 
 
 def _moving(points: Floats) -> tuple[Floats, NDArray[np.bool_]] | None:

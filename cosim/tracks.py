@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from agent_client.judge import Outcome
 from agent_client.reward import Regime
 from cosim.errors import RunError
 from cosim.runs import Run, column, read_run
+from cosim.scales import Quantity
 from cosim.scene import Scene, read_scene, where_is
 from cosim.senses import Sensors
 from meshes.centreline import parse_centreline
@@ -24,16 +25,6 @@ from meshes.wall import to_world
 from protocol.layout import Axes
 
 Floats = NDArray[np.float64]
-Quantity = Literal["clearance", "reward", "speed"]
-
-TITLES: Final[dict[str, str]] = {
-    "clearance": "gap to wall\n(m)",
-    "reward": "reward\nper step",
-    "speed": "speed\n(m/s)",
-}
-"""Of the scale of a quantity that colours a trajectory. The gap is that between body and wall."""
-# The colours of the centreline and of the camera's field are in neither scale.
-MAPS: Final[dict[str, str]] = {"clearance": "RdBu", "reward": "RdBu", "speed": "viridis"}
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from vtkmodules.vtkRenderingCore import vtkRenderWindow
 from cosim.cameras import Camera
 from cosim.errors import NoDisplayError, ViewError
 from cosim.film import Image
+from cosim.scales import Scale
 from cosim.scene import Surface
 from protocol.signals import held_signals
 
@@ -47,6 +48,14 @@ class Shape:
     def paint(self, colours: Image) -> None:
         """Colour its vertices, (V, 4) red, green, blue, opacity from 0 to 255."""
         self._mesh.pointcolors = colours
+
+    def shade(self, values: Floats, scale: Scale) -> None:
+        """Colour its vertices by values (V,)."""
+        table = np.array(vedo.color_map(np.arange(256), scale.colours, 0, 255))
+        low, high = scale.limits
+        share = np.clip((values - low) / (high - low), 0.0, 1.0)
+        opaque = np.ones((len(values), 1))
+        self.paint((255.0 * np.hstack([table[np.rint(255.0 * share).astype(int)], opaque])).astype(np.uint8))
 
     def place(self, position: Floats, rotation: Floats) -> None:
         """Put its own frame there: position (3,), rotation (3, 3) with the frame's axes as columns."""
@@ -132,36 +141,25 @@ class Stage:
         mesh = vedo.Mesh([surface.vertices, surface.faces], c=colour, alpha=alpha)
         return self._add(mesh.lighting("off") if flat else mesh.compute_normals().lighting("plastic"))
 
-    def scaled_line(
-        self,
-        points: Floats,
-        values: Floats,
-        *,
-        width: float,
-        colours: str,
-        limits: tuple[float, float],
-        title: str,
-    ) -> None:
-        """Draw a polyline (M, 3) coloured by values (M,), with their scale beside it if it has a title."""
-        line = vedo.Line(points, lw=width * self._unit)
-        line.pointdata["value"] = values
-        line.cmap(colours, "value", vmin=limits[0], vmax=limits[1]).lighting("off")
-        self._add(line)
-        if title:
-            line.add_scalarbar(
-                title,
-                pos=((0.9, 0.08), (0.97, 0.5)),
-                font_size=int(14 * self._unit),
-                title_yoffset=int(12 * self._unit),
-                nlabels=5,
-                label_format=":.2f",
-                c=INK,
-            )
-            scale = line.scalarbar
-            scale.SetDrawBackground(True)
-            scale.GetBackgroundProperty().SetColor(1.0, 1.0, 1.0)
-            scale.GetBackgroundProperty().SetOpacity(0.55)
-            self._plotter.add(scale)
+    def scale(self, scale: Scale) -> None:
+        """Show at the right what the colours of a scale mean."""
+        line = vedo.Line([(0.0, 0.0, 0.0), (0.0, 0.0, 1e-9)])
+        line.pointdata["value"] = np.array(scale.limits)
+        line.cmap(scale.colours, "value", vmin=scale.limits[0], vmax=scale.limits[1])
+        line.add_scalarbar(
+            scale.title,
+            pos=((0.885, 0.08), (0.975, 0.5)),
+            font_size=int(14 * self._unit),
+            title_yoffset=int(12 * self._unit),
+            nlabels=5,
+            label_format=":.2f",
+            c=INK,
+        )
+        bar = line.scalarbar
+        bar.SetDrawBackground(True)
+        bar.GetBackgroundProperty().SetColor(1.0, 1.0, 1.0)
+        bar.GetBackgroundProperty().SetOpacity(0.55)
+        self._plotter.add(bar)
 
     def dot(self, colour: str, size: float) -> Shape:
         """Draw a round dot that is as large from everywhere (pixels), to be moved."""

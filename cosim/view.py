@@ -17,7 +17,8 @@ from cosim.live import counting
 from cosim.mesh_view import MeshChoice, draw_figure, put_up_mesh
 from cosim.options import SHIPPED_MESH
 from cosim.playback import Playback, View
-from cosim.tracks import Quantity, Track, read_tracks
+from cosim.scales import Quantity
+from cosim.tracks import Track, read_tracks
 from meshes.tube import INDUSTRIAL
 from protocol.signals import held_signals
 

@@ -14,6 +14,9 @@ Floats = NDArray[np.float64]
 
 AGREED: Final = 0.8
 """Share of a wall's area that must agree for its own winding to be believed; else each triangle is judged alone."""
+ACROSS: Final = 0.1
+"""Cosine to the way out from the axis below which a triangle stands across the tube, as the face of a flange does:
+its side is not known, and it keeps its winding."""
 AXIS_POINTS: Final = 400
 _CHUNK: Final = 20_000
 
@@ -28,12 +31,16 @@ def face_outwards(surface: Surface, axis: Floats) -> Surface:
     corners = surface.vertices[surface.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     centres = corners.mean(axis=1)
-    outward = np.einsum("ij,ij->i", normals, centres - axis[_nearest(centres, axis)])
+    away = centres - axis[_nearest(centres, axis)]
+    outward = np.einsum("ij,ij->i", normals, away)
     area = np.linalg.norm(normals, axis=1)
     share = float(area[outward > 0.0].sum() / max(area.sum(), 1e-300))
     if share >= AGREED:
         return surface
-    turned = np.ones(len(area), dtype=bool) if share <= 1.0 - AGREED else outward < 0.0
+    if share <= 1.0 - AGREED:
+        turned = np.ones(len(area), dtype=bool)
+    else:
+        turned = outward < -ACROSS * area * np.linalg.norm(away, axis=1)
     faces = surface.faces.copy()
     faces[turned] = faces[turned][:, ::-1]
     return replace(surface, faces=faces)

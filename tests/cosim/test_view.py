@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from cosim.drone_figure import CAMERA_COLOUR
+from cosim.live_senses import LiveSenses
 from cosim.mesh_view import OPENING_COLOUR
 from cosim.playback import AXIS_COLOUR, RUN_COLOURS
 from cosim.tracks import read_tracks
+from meshes.tube import read_tube
 
 Picture = NDArray[np.int64]
 
@@ -200,6 +202,33 @@ def test_the_papers_figure_is_one_command(tmp_path: Path) -> None:
     assert edge.mean() < 130 < line.mean()
     assert (solid > 150).all(axis=2).mean() > 3 * (edge > 150).all(axis=2).mean(), "an opaque tube above"
     assert count(line, AXIS_COLOUR) > 20
+
+
+def test_the_live_viewer_works_out_what_the_agent_sensed(runs: tuple[Path, Path]) -> None:
+    """Gap, target and memory at every recorded pose are the agent's own, but for the wall's triangles (7 mm)."""
+    (track,) = read_tracks(runs[:1])
+    mesh, records = track.run.manifest["mesh"], track.run.records
+    tube = read_tube(mesh["path"], mesh["centreline"], "zup", 1.0)
+    steps = track.run.manifest["settings"]["memory"]["steps"]
+    senses = LiveSenses(tube, track.sensors, steps, track.body_radius)
+    visible = []
+    for k, record in enumerate(records):
+        sensed = senses.sense(k, np.array(record["position"]), np.array(record["quaternion"]))
+        assert sensed.gap == pytest.approx(record["clearance"] - track.body_radius, abs=0.008)
+        assert sensed.along == pytest.approx(record["arc_length"], abs=0.01)
+        visible.append(sensed.sighting.target is not None)
+        assert visible[-1] == record["target_visible"]
+        if visible[-1]:
+            assert sensed.sighting.target == pytest.approx(np.array(record["target_position"]), abs=0.01)
+    assert visible[-1]
+    x, y, z, w = records[-1]["quaternion"]
+    backwards = np.array([y, -x, w, -z])  # turned by half a turn about its own up
+    place = np.array(records[-1]["position"])
+    seen = np.array(records[-1]["target_position"]) - place
+    remembered = senses.sense(len(records) - 1 + steps, place, backwards).sighting
+    assert remembered.target is None
+    assert remembered.memory == pytest.approx(seen / np.linalg.norm(seen), abs=0.01)
+    assert senses.sense(len(records) + steps, place, backwards).sighting.memory is None
 
 
 def fails(*arguments: str | Path, saying: str) -> None:

@@ -15,6 +15,7 @@ import pytest
 from flights import DEADLINE, Done, command, environment, run_cosim
 from PIL import Image
 
+from cosim.drone_figure import CAMERA_COLOUR
 from cosim.live_scene import COMMAND_COLOUR, FRAME_SIZE
 
 TUBE = ("--tube", "level=2,seed=1234,length=8")
@@ -80,8 +81,9 @@ def test_the_viewer_draws_the_flight_and_leaves_its_hash_alone(
     first, last = (np.asarray(Image.open(path).convert("RGB")).astype(int) for path in (drawn[0], drawn[-1]))
     assert first.shape == (FRAME_SIZE[1], FRAME_SIZE[0], 3)
     assert (np.abs(first - last).max(axis=2) > 12).mean() > 0.1
-    green = np.array([int(COMMAND_COLOUR[i : i + 2], 16) for i in (1, 3, 5)])
-    assert (np.abs(last - green).max(axis=2) < 60).sum() > 5, "the command is an arrow"
+    for colour, what in ((COMMAND_COLOUR, "the command is an arrow"), (CAMERA_COLOUR, "the camera's field")):
+        shade = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
+        assert (np.abs(last[100:] - shade).max(axis=2) < 60).sum() > 5, what
 
 
 def test_a_viewer_that_is_killed_takes_nothing_with_it(
