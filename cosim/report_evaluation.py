@@ -6,12 +6,18 @@ import json
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from cosim.errors import RunError
 from cosim.evaluation_table import heading, legend
 from cosim.pilots import PURE_PURSUIT, TUNED_PURSUIT
 from cosim.runs import Run
+
+EPISODE: Final = (
+    "policy", "level", "seed", "outcome", "steps", "progress", "min_clearance_m", "conditions", "launch",
+    "launch_repeats",
+)  # fmt: skip
+"""What an episode must say of itself."""
 
 
 def read_results(path: Path) -> dict[str, Any]:
@@ -26,8 +32,20 @@ def read_results(path: Path) -> dict[str, Any]:
         raise RunError(f"{path}: expected results of an evaluation, found none ({error.strerror})") from error
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise RunError(f"{path}: expected JSON, found text that is not ({error})") from error
+    if isinstance(found, dict) and "trained_under" in found:
+        raise RunError(
+            f"{path}: expected results of `cosim evaluate --out`, found those of `cosim ablate`, which hold no "
+            "episodes; fly its policies side by side (cosim evaluate --policy VARIANT/seed0.zip --policy ... "
+            "--out DIR) and give that folder"
+        )
     if not (isinstance(found, dict) and {"rows", "paper", "flown"} <= found.keys()):
         raise RunError(f"{path}: expected rows and episodes of `cosim evaluate --out`, found neither")
+    for episode in found["flown"]:
+        if missing := [name for name in EPISODE if name not in episode]:
+            raise RunError(
+                f"{path}: expected of each episode {', '.join(EPISODE)}; found none of {', '.join(missing)}: "
+                "results of another version of cosim; evaluate again"
+            )
     return found
 
 
@@ -49,20 +67,8 @@ def describe_evaluation(path: Path, results: Mapping[str, Any], runs: Sequence[R
         "paper": results["paper"],
         "episodes": len(flown),
         "failures": [
-            {
-                name: episode[name]
-                for name in (
-                    "policy",
-                    "level",
-                    "seed",
-                    "outcome",
-                    "steps",
-                    "progress",
-                    "min_clearance_m",
-                    "launch",
-                )
-            }
-            | {"repeats": episode["launch_repeats"], "run": _flown_again(episode, runs)}
+            {name: episode[name] for name in EPISODE if name != "conditions"}
+            | {"run": _flown_again(episode, runs)}
             for episode in failures
         ],
     }

@@ -104,7 +104,7 @@ function failuresOf(evaluation, runs, onFocus) {
         `Show all ${failures.length} failures`,
       )
     : null;
-  const repeats = failures[0].repeats ? "which repeats it bit for bit" : "in another world than the evaluation’s";
+  const repeats = failures[0].launch_repeats ? "which repeats it bit for bit" : "in another world than the evaluation’s";
   const linked = failures.filter((failure) => failure.run !== null).length || "None";
   return [
     make("h2", {}, `Failures: ${failures.length} of ${evaluation.episodes} episodes`),

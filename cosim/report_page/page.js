@@ -112,11 +112,15 @@ class Report {
     });
     this.dial = new Dial(byId("dial"));
     try {
+      if (!has3d()) throw new Error("it is switched off, or there is no driver for it");
       this.view = new View(data, byId("canvas"));
     } catch (error) {
+      byId("view").classList.add("flat");
       byId("no-view").hidden = false;
       byId("no-view").textContent =
-        `No 3-D here, since this browser has no WebGL (${error.message}). Everything else works.`;
+        `No 3-D here, since this browser has no WebGL (${error.message}). Everything else works: the section seen ` +
+        "from behind and the charts follow the slider.";
+      byId("camera").parentElement.hidden = true;
     }
     this.colourBy = this.many ? "run" : "clearance";
     this._controls();

@@ -6,6 +6,12 @@ const FOLLOW_DISTANCE = 5; // over R
 const REST = 350; // ms
 const HAZE = 0.35; // an R of distance, on board
 const FILLED = 0.84; // of the view, by the tube
+
+/** Whether this browser draws in 3-D at all. */
+function has3d() {
+  return !!document.createElement("canvas").getContext("webgl2");
+}
+
 /** Whether a GPU draws; else the processor does, and smooth edges would cost most of its time. */
 function drawnByGpu() {
   return !!document.createElement("canvas").getContext("webgl2", { failIfMajorPerformanceCaveat: true });
@@ -81,7 +87,12 @@ class View {
     this.data = data;
     this.canvas = canvas;
     this.quick = drawnByGpu();
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: this.quick, alpha: true });
+    this.renderer = new THREE.WebGLRenderer({
+      canvas,
+      antialias: this.quick,
+      alpha: true,
+      preserveDrawingBuffer: true, // a printer comes later than the frame
+    });
     this.ratio = Math.min(window.devicePixelRatio, 2);
     this.scene = new THREE.Scene();
     this.tubes = data.tubes.map((tube) => new TubeView(tube));
@@ -100,7 +111,7 @@ class View {
     this.camera.up.copy(UP);
     this.controls = new THREE.OrbitControls(this.camera, canvas);
     this.controls.enableDamping = false;
-    canvas.style.touchAction = "pan-y"; // a finger that goes up or down scrolls the page
+    this._letScroll();
     this.controls.addEventListener("change", () => this.redraw());
     this.layers = { path: true, axis: true, rays: true, cone: true, target: true };
     this.tubeMode = "glass";
@@ -108,6 +119,28 @@ class View {
     this.focus = data.runs[0];
     this.visible = new Set(data.runs);
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
+  }
+
+  /** Leave wheel and finger to the page until the view is meant: a click makes the wheel its own, until the mouse goes. */
+  _letScroll() {
+    const { canvas, controls } = this;
+    controls.enableZoom = false;
+    canvas.style.touchAction = "pan-y"; // one finger that goes up or down scrolls, across it turns the view
+    canvas.addEventListener("pointerdown", ({ pointerType, isPrimary }) => {
+      controls.enableZoom = true;
+      const held = pointerType === "touch" && isPrimary ? controls.getPolarAngle() : null;
+      controls.minPolarAngle = held ?? 0;
+      controls.maxPolarAngle = held ?? Math.PI;
+    });
+    canvas.addEventListener("pointerleave", ({ pointerType }) => {
+      if (pointerType === "mouse") controls.enableZoom = false;
+    });
+    for (const kind of ["pointerup", "pointercancel"]) {
+      canvas.addEventListener(kind, () => {
+        controls.minPolarAngle = 0;
+        controls.maxPolarAngle = Math.PI;
+      });
+    }
   }
 
   /** Take colours from the style sheet, at the start and when the colour scheme changes. */

@@ -235,6 +235,14 @@ def test_text_of_the_data_is_never_markup(tmp_path: Path) -> None:
         (lambda folder: None, "expected the manifest of a run"),
         (lambda folder: (folder / "results.json").write_text("[1"), "expected JSON"),
         (lambda folder: (folder / "results.json").write_text('{"rows": []}'), "expected rows and episodes"),
+        (
+            lambda folder: (folder / "results.json").write_text('{"rows": [], "trained_under": {}}'),
+            "found those of `cosim ablate`",
+        ),
+        (
+            lambda folder: (folder / "results.json").write_text(json.dumps(evaluation_results(flown=[{}]))),
+            "results of another version",
+        ),
     ],
 )
 def test_what_is_no_run_is_refused(make: Any, complaint: str, tmp_path: Path) -> None:

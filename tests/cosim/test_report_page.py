@@ -140,6 +140,22 @@ def test_the_camera_follows_the_drone_and_looks_out_of_it(opened: Browser, run: 
     assert_at(run, 250, np.array(opened.run("return report.view.camera.position.toArray()")))
 
 
+def test_the_view_does_not_hold_a_reader_who_scrolls_by(opened: Browser) -> None:
+    """The wheel is the page's until the view is clicked and again once the mouse is gone; a finger scrolls too."""
+    taken = (
+        "const canvas = document.getElementById('canvas');"
+        "const send = (kind) => canvas.dispatchEvent("
+        "  new PointerEvent(kind, { pointerId: 1, pointerType: 'mouse', isPrimary: true, bubbles: true }));"
+        "const wheel = () => !canvas.dispatchEvent(new WheelEvent('wheel', { deltaY: 100, cancelable: true }));"
+        "canvas.setPointerCapture = canvas.releasePointerCapture = () => {};"
+        "const found = [wheel()];"
+        "send('pointerdown'); send('pointerup'); found.push(wheel());"
+        "send('pointerleave'); found.push(wheel());"
+        "return [found, getComputedStyle(canvas).touchAction]"
+    )
+    assert opened.run(taken) == [[False, True, False], "pan-y"]
+
+
 def test_scans_end_on_the_wall(opened: Browser, run: Run) -> None:
     """The ends of the drawn LiDAR rays are as far from the axis as the tube is wide, give or take its fittings."""
     opened.run("report.player.seekRecord(30)")
