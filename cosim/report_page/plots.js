@@ -80,9 +80,12 @@ class Chart {
     for (const kind of ["pointerdown", "pointermove"]) {
       this.svg.addEventListener(kind, (event) => {
         if (kind === "pointerdown") this.svg.setPointerCapture(event.pointerId);
-        if (event.buttons & 1) plots.seek(this.fromX(event.clientX - this.svg.getBoundingClientRect().left));
+        const x = this.fromX(event.clientX - this.svg.getBoundingClientRect().left);
+        if (event.buttons & 1) plots.seek(x);
+        else plots.peek(x);
       });
     }
+    this.svg.addEventListener("pointerleave", () => plots.peek(null));
   }
 
   /** The curves of all visible runs, or those of the only one. */
@@ -125,7 +128,9 @@ class Chart {
     const below = ticks(x0, x1, width / 90).map(({ value, text }, i, all) =>
       make("text", { x: this.toX(value), y: HEIGHT - 4, class: "tick x" }, i === all.length - 1 ? text + unit : text),
     );
-    this.cursor = make("g", { class: "cursor" }, make("line", { y1: MARGIN.top, y2: HEIGHT - MARGIN.bottom }));
+    this.place = make("text", { y: MARGIN.top + 9, class: "tick place" });
+    const line = make("line", { y1: MARGIN.top, y2: HEIGHT - MARGIN.bottom });
+    this.cursor = make("g", { class: "cursor" }, line, this.place);
     this.svg.replaceChildren(body, ...below, this.cursor);
     this._legend();
     this.point();
@@ -225,17 +230,24 @@ class Chart {
     this.cursor.append(...this.values.map(({ dot }) => dot));
   }
 
-  /** Move the cursor to where the runs are now. */
+  /** Move the cursor to where the mouse points, else to where the runs are now. */
   point() {
     const { plots } = this,
       focus = plots.focus,
-      { record } = recordAt(focus, plots.time);
-    const x = this.toX(plots.abscissa(focus)[record]).toFixed(1),
+      time = plots.peeked ?? plots.time,
+      { record } = recordAt(focus, time);
+    const here = plots.abscissa(focus)[record],
+      x = this.toX(here),
       line = this.cursor.firstChild;
-    line.setAttribute("x1", x);
-    line.setAttribute("x2", x);
+    line.setAttribute("x1", x.toFixed(1));
+    line.setAttribute("x2", x.toFixed(1));
+    const late = x > 0.8 * this.width;
+    this.place.textContent =
+      plots.peeked === null ? "" : plots.by === "time" ? `${fixed(here, 1)} s` : `${fixed(here, 2)} m`;
+    this.place.setAttribute("x", (late ? x - 5 : x + 5).toFixed(1));
+    this.place.setAttribute("text-anchor", late ? "end" : "start");
     for (const { curve, value, dot } of this.values) {
-      const at = recordAt(curve.run, plots.time).record,
+      const at = recordAt(curve.run, time).record,
         y = curve.values[at];
       value.textContent = say(y);
       dot.setAttribute("visibility", Number.isFinite(y) ? "visible" : "hidden");
@@ -255,6 +267,7 @@ class Plots {
     this.by = "time";
     this.span = Infinity;
     this.time = 0;
+    this.peeked = null;
     this.charts = CHARTS.map((definition) => new Chart(definition, this));
     root.append(...this.charts.map((chart) => chart.root));
     this.measure();
@@ -311,12 +324,23 @@ class Plots {
     else this.draw();
   }
 
+  /** Read the curves off where the focus was at this x, without going there; null ends it. */
+  peek(x) {
+    this.peeked = x === null ? null : this._timeAt(x);
+    this.charts.forEach((chart) => chart.point());
+  }
+
   /** Go to where the focus was at this x. */
   seek(x) {
+    this.peeked = null;
+    this.onSeek(this._timeAt(x));
+  }
+
+  _timeAt(x) {
     const xs = this.abscissa(this.focus),
       [from, to] = this.records(this.focus);
     let best = from;
     for (let i = from; i <= to; i++) if (Math.abs(xs[i] - x) < Math.abs(xs[best] - x)) best = i;
-    this.onSeek(this.focus.series.time[best]);
+    return this.focus.series.time[best];
   }
 }

@@ -168,8 +168,11 @@ def test_scans_end_on_the_wall(opened: Browser, run: Run) -> None:
     np.testing.assert_allclose(np.linalg.norm(away, axis=1), record["radius"], rtol=0.15)
 
 
-def test_every_chart_has_its_curves_and_the_cursor_goes_along(opened: Browser) -> None:
-    """Ten charts with at least one curve or band each; the cursor moves with the slider, a click moves the slider."""
+def test_every_chart_has_its_curves_and_the_cursor_goes_along(opened: Browser, run: Run) -> None:
+    """Ten charts with at least one curve or band each; the cursor moves with the slider, a click moves the slider.
+
+    The mouse alone reads the curves off where it is, and leaves the replay where that was.
+    """
     charts = opened.run(
         "return [...document.querySelectorAll('.chart')].map((chart) => [chart.id,"
         "[...chart.querySelectorAll('path.curve')].filter((path) => path.getAttribute('d').length > 50).length"
@@ -185,6 +188,17 @@ def test_every_chart_has_its_curves_and_the_cursor_goes_along(opened: Browser) -
     chart.click()  # in its middle
     middle = opened.run("return report.state().record / report.runs[0].count")
     assert middle == pytest.approx(0.5, abs=0.08)
+    hovered = opened.run(
+        "const chart = report.plots.charts[0], run = report.runs[0], box = chart.svg.getBoundingClientRect();"
+        "const at = (x) => chart.svg.dispatchEvent("
+        "  new PointerEvent('pointermove', { clientX: box.left + x, pointerType: 'mouse' }));"
+        "at(chart.toX(run.series.time[77]));"
+        "const read = [chart.values[0].value.textContent, chart.place.textContent, report.state().record];"
+        "chart.svg.dispatchEvent(new PointerEvent('pointerleave'));"
+        "return [...read, chart.place.textContent]"
+    )
+    clearance = run.records["clearance"][77]
+    assert hovered == [f"{clearance:.3f}", "7.7 s", round(middle * len(run.records)), ""]
 
 
 def test_curves_are_drawn_by_arc_length_and_over_a_span_too(opened: Browser) -> None:
