@@ -59,18 +59,25 @@ def test_the_page_is_whole_in_itself(page: Path) -> None:
 
 
 def test_the_page_holds_what_was_recorded(content: PageData, conduit_run: tuple[Done, Path]) -> None:
-    """Positions, attitudes, times and scans of every record, and the outcome as the flight reported it."""
+    """Every curve is its column of the log in single precision, and the figures are what the flight reported."""
     run, done = read_run(conduit_run[1]), conduit_run[0]
     (shown,) = content.data["runs"]
     series = {name: content.array(number) for name, number in shown["series"].items()}
-    for name, column in (("position", "position"), ("quaternion", "quaternion"), ("time", "sim_time")):
-        assert np.array_equal(series[name], run.records[column].astype(np.float32))
+    made = {"speed", "velocity", "curvature", "S_F", "S_R", "step_time", "lidar", "time"}
+    for name in series.keys() - made:
+        recorded = run.records[name].astype(series[name].dtype)
+        np.testing.assert_array_equal(series[name], recorded, err_msg=name)
+    assert np.array_equal(series["time"], run.records["sim_time"].astype(np.float32))
+    speed = np.linalg.norm(run.records["linear_velocity"], axis=1)
+    np.testing.assert_allclose(series["speed"], speed, atol=1e-6)
+    np.testing.assert_allclose(series["step_time"], 1e-9 * run.records["phases"].sum(axis=1), rtol=1e-6)
     reach = shown["lidar"]["reach"]
     np.testing.assert_allclose(
         series["lidar"] * reach / 255.0, run.records["lidar"], atol=0.5 * reach / 255.0 + 1e-9
     )
     assert (shown["outcome"], shown["steps"]) == (done.report["outcome"], done.report["steps"])
-    assert shown["trajectory_hash"] == done.report["trajectory_hash"]
+    for name in ("trajectory_hash", "contacts", "progress", "quality", "steps_per_second"):
+        assert shown[name] == done.report[name], name
     assert shown["gap"] == pytest.approx(done.report["min_clearance_m"], abs=1e-12)
     assert shown["manifest"]["mesh"]["sha256"] == run.manifest["mesh"]["sha256"]
 
