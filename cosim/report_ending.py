@@ -19,6 +19,8 @@ ASIDE: Final = np.sin(np.pi / 8)
 """Least share of a direction along one axis of the body for which that side is named."""
 PROBE: Final = 1e-4
 """Over which the distance to the wall is differentiated, over the distance."""
+STANDSTILL: Final = 1.0
+"""Seconds without progress after which a flight does not come on."""
 SIDES: Final = (("ahead", "behind"), ("above", "below"), ("to the right", "to the left"))
 """Of the drone, along its axes f, u and r and against them."""
 
@@ -109,11 +111,14 @@ def _title(run: Run, at: int, ended: Outcome, contact: bool) -> str:
 
 
 def _stalled(run: Run) -> str:
-    """How far a flight came at last, and when."""
+    """How far a flight came at last, and whether it still came on."""
     along = np.maximum.accumulate(column(run, "arc_length"))
     step = 0.1 * float(run.records[-1]["radius"])
-    last = int(np.argmax(along > along[-1] - step))
-    return f"it came as far as {along[-1]:.2f} m, most of it by {run.records[last]['sim_time']:.1f} s"
+    times = run.records["sim_time"]
+    since = float(times[int(np.argmax(along > along[-1] - step))])
+    if times[-1] - since < STANDSTILL:
+        return f"it was still coming on, at {along[-1]:.2f} m"
+    return f"it came to {along[-1]:.2f} m in {since:.1f} s and no further"
 
 
 def _place(run: Run, at: int, curvature: float) -> str:
