@@ -66,10 +66,17 @@ def inspect(options: InspectOptions, *, as_json: bool) -> dict[str, Any]:
     """
     made = _check_folder(options.out)
     try:
+        return _inspect(options, as_json)
+    except BaseException:
+        remove_empty(made)
+        raise
+
+
+def _inspect(options: InspectOptions, as_json: bool) -> dict[str, Any]:
+    try:
         tube = _read(options)
     except MeshError as error:
         _report_refusal(options, error, as_json)
-        remove_empty(made)
         raise
     if options.out is not None and tube.found is not None and _centreline_in(options.out, tube).exists():
         raise OutputError(
@@ -155,7 +162,10 @@ def _write(
     """Write pictures, and the centreline where it was found; the paths."""
     from cosim.inspect_plots import draw_overview, draw_profile
 
-    written = []
+    written = [
+        draw_profile(folder / PROFILE, tube.path.name, profile, body_radius),
+        draw_overview(folder / OVERVIEW, tube.wall, profile, construction.openings, body_radius),
+    ]
     if tube.found is not None:
         path = _centreline_in(folder, tube)
         try:
@@ -163,11 +173,7 @@ def _write(
         except OSError as error:
             raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
         written.append(path)
-    return [
-        draw_profile(folder / PROFILE, tube.path.name, profile, body_radius),
-        draw_overview(folder / OVERVIEW, tube.wall, profile, construction.openings, body_radius),
-        *written,
-    ]
+    return written
 
 
 def _centreline_in(folder: Path, tube: Tube) -> Path:
