@@ -38,8 +38,8 @@ RECORDS: Final = 25_000
 TRIANGLES: Final = 80_000
 """Triangles that a page holds, of all its tubes together; of more, each tube keeps the same share."""
 SCRIPTS: Final = (
-    "data.js", "shapes.js", "tube.js", "senses.js", "ending.js", "view.js", "dial.js", "charts.js", "plots.js",
-    "tables.js", "evaluation.js", "player.js", "page.js",
+    "data.js", "shapes.js", "tube.js", "senses.js", "ending.js", "view.js", "plan.js", "dial.js", "charts.js",
+    "plots.js", "tables.js", "evaluation.js", "player.js", "page.js",
 )  # fmt: skip
 """Parts of the page's one script, in order."""
 

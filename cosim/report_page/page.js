@@ -118,10 +118,10 @@ class Report {
       byId("view").classList.add("flat");
       byId("no-view").hidden = false;
       byId("no-view").textContent =
-        `No 3-D here, since this browser has no WebGL (${error.message}). Everything else works: the section seen ` +
-        "from behind and the charts follow the slider.";
+        `No 3-D here, since this browser has no WebGL (${error.message}): seen from the side instead.`;
       byId("camera").parentElement.hidden = true;
     }
+    this.stage = this.view ?? new Plan(data, byId("view"));
     this.colourBy = this.many ? "run" : "clearance";
     this._controls();
     const first = runs[0];
@@ -216,7 +216,7 @@ class Report {
     visible.add(focus);
     this.focus = focus;
     this.visible = visible;
-    this.view?.choose(focus, visible);
+    this.stage.choose(focus, visible);
     this.plots.choose(focus, visible);
     byId("ending").replaceChildren(...endingOf(focus, (time) => this.lookAt(time)));
     byId("phase-rows").replaceChildren(...phasesOf(focus));
@@ -265,7 +265,7 @@ class Report {
   }
 
   _place(time) {
-    this.view?.place(time);
+    this.stage.place(time);
     this.plots.place(time);
     this._readout(time);
   }

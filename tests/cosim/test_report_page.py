@@ -375,7 +375,7 @@ def test_a_run_of_one_record_is_shown(browser: Browser, run: Run, tmp_path: Path
 
 
 def test_it_does_without_webgl(browser: Browser, page: Path, tmp_path: Path) -> None:
-    """Where the browser has no WebGL the page says so, and everything but the view works."""
+    """Where the browser has no WebGL the page says so and shows the flight from the side; all else works as ever."""
     blind = tmp_path / "blind.html"
     blind.write_text(
         page.read_text().replace(
@@ -386,8 +386,11 @@ def test_it_does_without_webgl(browser: Browser, page: Path, tmp_path: Path) -> 
     )
     browser.open(blind)
     assert "no WebGL" in browser.run("return document.getElementById('no-view').textContent")
+    before = browser.run("return +document.querySelector('.plan circle').getAttribute('cx')")
     browser.run("report.player.seekRecord(100)")
     assert browser.run("return document.querySelectorAll('path.curve').length") > 10
+    assert abs(browser.run("return +document.querySelector('.plan circle').getAttribute('cx')") - before) > 50
+    assert browser.complaints() == []
 
 
 def test_strips_show_what_was_recorded_however_many_records_a_pixel_has(opened: Browser) -> None:
