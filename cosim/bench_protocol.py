@@ -78,7 +78,7 @@ def bench_protocol(*, as_json: bool, quick: bool, png: Path | None, only: Sequen
     if png is not None:
         from cosim.latency_figure import check_figure
 
-        check_figure(png)  # says what to install before anything is measured
+        check_figure()  # says what to install before anything is measured
 
     def say(text: str) -> None:
         click.echo(text, err=True)

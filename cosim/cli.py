@@ -37,19 +37,22 @@ class _Commands(click.Group):
         with _unread_output():
             return super().invoke(ctx)
 
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The commands alone: the line of usage names the options, and all has to fit on a screen."""
+        self.format_commands(ctx, formatter)
+
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Names as they are listed."""
         return list(self.commands)
 
 
-@click.group(cls=_Commands, context_settings=CONTEXT)
+@click.group(cls=_Commands, context_settings=CONTEXT, options_metavar="[--version | --help]")
 @click.version_option(__version__, prog_name="cosim")
 def cosim() -> None:
-    """Fly a learned drone policy through a tube, in lockstep with a physics engine.
+    """Fly a learned policy through a tube, in lockstep with a physics engine.
 
     \b
-    cosim launch                           the shipped policy through the shipped conduit
-    cosim launch --mesh M.obj --policy P   your tube, your policy
+    cosim launch --mesh tube.obj --scale radius=1   # the shipped policy flies it
     """
 
 

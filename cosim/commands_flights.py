@@ -12,15 +12,15 @@ from typing import Any
 import click
 
 from cosim.named_settings import SettingsCommand, take_settings
-from cosim.options import FlightOptions, evaluate_options, flight_options
-from cosim.screens import EXIT_NO_SUCCESS, command, json_option, option
+from cosim.options import POLICY_HELP, FlightOptions, PolicyType, evaluate_options, flight_options
+from cosim.screens import EXIT_NO_SUCCESS, command, json_option, option, rare
 
 
 @command(cls=SettingsCommand, short_help="Fly a policy through a tube, physics in its own process.")
 @flight_options
-@option("--view", is_flag=True, help="Show it live in a window, at --realtime 1 unless told otherwise.")
+@option("--view", is_flag=True, help="Show it live in a window, at --realtime 1.")
 @click.option("--view-frames", type=click.Path(path_type=Path, exists=True, file_okay=False), hidden=True)
-@option("--require-success", is_flag=True, help="Exit 1 unless the outcome is success.")
+@rare("--require-success", is_flag=True, help="Exit 1 unless the outcome is success.")
 @json_option
 def launch(
     view: bool, view_frames: Path | None, require_success: bool, as_json: bool, **options: Any
@@ -41,11 +41,11 @@ def launch(
         sys.exit(EXIT_NO_SUCCESS)
 
 
-@command(cls=SettingsCommand, short_help="Fly pilots through unseen tubes, beside the paper's figures.")
+@command(cls=SettingsCommand, short_help="Fly pilots through unseen tubes, and print the paper's table.")
 @evaluate_options
 @json_option
 def evaluate(as_json: bool, **options: Any) -> None:
-    """Fly pilots through the same unseen tubes, and print the paper's table side by side.
+    """Fly pilots through the same unseen tubes, and print the paper's table.
 
     \b
     cosim evaluate --policy tube_ppo --dynamics rigid-body --hard
@@ -59,11 +59,11 @@ def evaluate(as_json: bool, **options: Any) -> None:
 
 @command(short_help="Let another policy fly on from a step of a run.")
 @click.argument("run", type=click.Path(path_type=Path))
-@option("--policy", required=True, metavar="PATH|pure-pursuit|lidar-rule", help="Who flies on.")
+@option("--policy", type=PolicyType(), required=True, metavar="P", help=f"Who flies on: {POLICY_HELP}.")
 @option(
     "--from-step", type=click.IntRange(min=0), required=True, metavar="K", help="The last step of the run."
 )
-@option("--server", metavar="COMMAND", help="Physics process, the rendezvous appended [default: the run's].")
+@option("--server", metavar="COMMAND", help="Start your physics as COMMAND RENDEZVOUS.")
 @option(
     "--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [default: a new one in runs/]."
 )

@@ -13,7 +13,7 @@ import click
 
 from cosim.errors import PEER
 from cosim.protocol_bars import WAYS
-from cosim.screens import EXIT_FAILED_CHECK, FiniteRange, command, json_option, option
+from cosim.screens import EXIT_FAILED_CHECK, FiniteRange, OutputFile, command, json_option, option, rare
 
 PROGRAM: Final = "cosim"
 
@@ -50,40 +50,36 @@ def watch(as_json: bool, **options: Any) -> None:
 @option(
     "--server",
     metavar="COMMAND",
-    help="Physics side, started as COMMAND RENDEZVOUS for every rule; {} in COMMAND stands for RENDEZVOUS.",
+    help="Physics side; RENDEZVOUS is appended, or put for {}.",
 )
 @option("--agent", metavar="COMMAND", help="Agent, started likewise.")
 @option(
     "--transport",
     type=click.Choice(["shm", "file"]),
     default="shm",
-    show_default=True,
-    help="Of the segments.",
+    metavar="NAME",
+    help="shm [default] or file.",
 )
-@option("--level", "levels", metavar="A,B,...", help="core, robustness, lanes, performance [default: all].")
+@option("--level", "levels", metavar="A,B", help="core, robustness, lanes, performance [default: all].")
 @option("--rule", "names", metavar="NAME", multiple=True, help="This rule alone; may be repeated.")
 @option(
     "--timeout",
     type=FiniteRange(min=0.1, max=3600.0),
-    metavar="SECONDS",
+    metavar="S",
     default=10.0,
-    show_default=True,
-    help="To start or to answer.",
+    help="To start or to answer [default: 10].",
 )
-@option("--junit", type=click.Path(path_type=Path), metavar="FILE", help="Write JUnit XML as well.")
+@option("--junit", type=OutputFile(), metavar="FILE", help="Write JUnit XML as well.")
 @option("--failed", "failed_only", is_flag=True, help="Leave out of the text the rules that passed.")
 @option("--list", "as_list", is_flag=True, help="Name the rules and run none.")
 @json_option
 def conformance(as_list: bool, as_json: bool, failed_only: bool, **options: Any) -> None:
-    """Prove any program against the rules of the protocol, which protocol/README.md specifies.
+    """Prove a program against the rules of the protocol (protocol/README.md).
 
-    Exit status 0 if every required rule holds, else 1. A rule is skipped where the program says that it cannot do
-    what the rule is about.
+    Exits 1 unless every required rule holds. What a program says that it cannot do is skipped.
 
     \b
-    cosim conformance --server "python -m physics_server"
     cosim conformance --server ./server --transport file --junit report.xml
-    cosim conformance --agent "python -m protocol.conformance.toy_agent" --json
     cosim conformance --agent "cosim launch --max-steps 30 --connect" --level core
     """
     from cosim.conformance import ConformanceOptions
@@ -94,9 +90,7 @@ def conformance(as_list: bool, as_json: bool, failed_only: bool, **options: Any)
 
 
 @command(short_help="Check this machine, and what dead sessions left on it.")
-@option(
-    "--clean", is_flag=True, help="Remove segments of sessions proved dead, and forgotten scratch folders."
-)
+@option("--clean", is_flag=True, help="Remove what is proved dead or forgotten.")
 @json_option
 def doctor(clean: bool, as_json: bool) -> None:
     """Look at Python, libraries, shared memory, leftovers, cores, clock and optional programs, with what to do.
@@ -115,17 +109,11 @@ def doctor(clean: bool, as_json: bool) -> None:
 @command(short_help="Measure round trips, control loop, start-up, runs, training.")
 @json_option
 @option("--quick", is_flag=True, help="Fewer samples: a look, not a measurement.")
-@option("--training", is_flag=True, help="The speed of training instead: environment, PPO, past the paper.")
-@option("--runs", is_flag=True, help="What surrounds a flight instead: live viewer, verify, report; bars.")
-@option(
-    "--protocol",
-    is_flag=True,
-    help="The protocol instead: against the field, the floor, lanes, observers, bars.",
-)
-@option(
-    "--png", type=click.Path(path_type=Path), metavar="FILE", help="With --protocol: draw all round trips."
-)
-@option(
+@option("--training", is_flag=True, help="Training instead: environment, PPO, past the paper.")
+@option("--runs", is_flag=True, help="What surrounds a flight: live viewer, verify, report.")
+@option("--protocol", is_flag=True, help="The protocol: against the field, lanes, observers.")
+@option("--png", type=OutputFile(), metavar="FILE", help="With --protocol: draw all round trips.")
+@rare(
     "--only",
     metavar="A,B,...",
     help=f"With --protocol: these ways alone, out of {', '.join(WAYS)} [default: all].",
@@ -143,7 +131,7 @@ def bench(
 
     \b
     cosim bench --quick
-    cosim bench --protocol --png round_trips.png   # against UDP, ZeroMQ, gRPC, ...
+    cosim bench --protocol --png trips.png   # against UDP, ZeroMQ, gRPC, ...
     """
     parts = {"--training": training, "--runs": runs, "--protocol": protocol}
     if sum(parts.values()) > 1:
@@ -171,8 +159,8 @@ def completion(ctx: click.Context, shell: str) -> None:
     """Print the script that makes SHELL complete commands, options and their values.
 
     \b
-    eval "$(cosim completion bash)"                                  # in ~/.bashrc
-    eval "$(cosim completion zsh)"                                   # in ~/.zshrc
+    eval "$(cosim completion bash)"   # in ~/.bashrc
+    eval "$(cosim completion zsh)"    # in ~/.zshrc, after compinit
     cosim completion fish > ~/.config/fish/completions/cosim.fish
     """
     from click.shell_completion import get_completion_class

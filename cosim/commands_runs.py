@@ -12,21 +12,21 @@ from typing import Any, Final
 import click
 
 from cosim.options import inspect_options, view_options
-from cosim.screens import EXIT_NO_SUCCESS, command, json_option, option
+from cosim.screens import EXIT_NO_SUCCESS, OutputFile, command, json_option, option
 
 FORMATS: Final = ("csv", "npz", "parquet", "tum", "mcap", "gltf", "usd")
 """Of `cosim.export`, whose imports a command's help does not wait for."""
 
 
-@command(short_help="Say whether a mesh can be flown through, and what its tube is like.")
+@command(short_help="Say whether a mesh can be flown, and what its tube is like.")
 @click.argument("mesh", type=click.Path(path_type=Path))
 @inspect_options
 @json_option
 def inspect(mesh: Path, as_json: bool, **options: Any) -> None:
-    """Find the centreline of a MESH and say, by arc length, what its tube is like; or why it cannot be flown.
+    """Find the centreline of a MESH and say what its tube is like, by arc length.
 
-    Reads .obj, .stl, .ply, .off, .glb, .gltf and .dae. --out writes profile.png, overview.png, inspection.json and
-    the centreline for --centerline. Exits 2 with the reason and the place where there is no tube to fly.
+    Reads .obj, .stl, .ply, .off, .glb, .gltf and .dae. Exits 2 with the reason and the place where there is no tube
+    to fly.
 
     \b
     cosim inspect tube.stl --out inspection
@@ -42,9 +42,9 @@ def inspect(mesh: Path, as_json: bool, **options: Any) -> None:
 @click.argument("sources", nargs=-1, type=click.Path(path_type=Path), metavar="[RUN ...|MESH]")
 @view_options
 def view(sources: tuple[Path, ...], **options: Any) -> None:
-    """Show recorded runs, or a MESH with its centreline and openings, in a window; [default: the shipped mesh].
+    """Show runs, or a MESH with its centreline and openings, in a window.
 
-    The tube is cut open towards the camera. Keys: space plays, arrows step, c changes the camera, q quits.
+    Keys: space plays, arrows step, c changes the camera, q quits.
 
     \b
     cosim view runs/2026-...
@@ -59,9 +59,7 @@ def view(sources: tuple[Path, ...], **options: Any) -> None:
 
 @command(short_help="Write one HTML page of runs and evaluations.")
 @click.argument("sources", type=click.Path(path_type=Path), nargs=-1, required=True, metavar="RUN...")
-@option(
-    "--out", type=click.Path(path_type=Path), metavar="FILE.html", help="Page [default: RUN/report.html]."
-)
+@option("--out", type=OutputFile(), metavar="FILE", help="Page [default: RUN/report.html].")
 @option(
     "--fly",
     type=click.IntRange(min=0),
@@ -87,13 +85,21 @@ def report(sources: tuple[Path, ...], out: Path | None, fly: int) -> None:
 
 @command(short_help="Write a recorded run in another format.")
 @click.argument("run", type=click.Path(path_type=Path))
-@option("--format", "kind", type=click.Choice(FORMATS), required=True)
-@option("--output", "-o", type=click.Path(path_type=Path), help="File [default: RUN/steps.<format>].")
+@option("--format", "kind", type=click.Choice(FORMATS), metavar="NAME", required=True, help="One of these.")
+@option(
+    "--out",
+    "--output",
+    "-o",
+    "output",
+    type=OutputFile(),
+    metavar="FILE",
+    help="[default: RUN/steps.<format>]",
+)
 def export(run: Path, kind: str, output: Path | None) -> None:
     """Write a recorded run in another format, from its folder alone.
 
     \b
-    parquet, npz, csv  every number of every step; with units and frames, but for csv
+    parquet, npz, csv  every number of every step; units and frames but in csv
     tum                trajectory for `evo` and SLAM benchmarks
     mcap               poses, scans, commands and state for Foxglove
     gltf, usd          animated scene for Blender, Unity and web viewers
@@ -113,7 +119,7 @@ def export(run: Path, kind: str, output: Path | None) -> None:
 @click.argument("run", type=click.Path(path_type=Path))
 @option("--mesh", type=click.Path(path_type=Path), metavar="PATH", help="Where its tube is now.")
 @option("--policy", type=click.Path(path_type=Path), metavar="PATH", help="Where its policy is now.")
-@option("--server", metavar="COMMAND", help="Physics process, the rendezvous appended [default: the run's].")
+@option("--server", metavar="COMMAND", help="Start your physics as COMMAND RENDEZVOUS.")
 @json_option
 def verify(run: Path, mesh: Path | None, policy: Path | None, server: str | None, as_json: bool) -> None:
     """Check that a run is whole, and that a fresh physics process makes the same poses of its commands, bit for bit.

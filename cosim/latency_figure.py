@@ -15,16 +15,13 @@ from cosim.round_trip import Samples
 BINS = 120
 
 
-def check_figure(path: Path) -> None:
-    """Make sure that a figure can be drawn at `path`.
+def check_figure() -> None:
+    """Make sure that a figure can be drawn.
 
     Raises:
         CosimError: matplotlib is not installed.
-        OutputError: the folder is not there.
     """
     _matplotlib()
-    if not path.resolve().parent.is_dir():
-        raise OutputError(f"{path}: there is no folder {path.resolve().parent}; make it first")
 
 
 def draw_histogram(samples: Mapping[str, Samples], path: Path) -> None:

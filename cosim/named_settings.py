@@ -198,7 +198,7 @@ class SettingsCommand(Command):
         hard = click.Option(["--hard"], is_flag=True, help="The hard conditions, in hard tubes.")
         listing = click.Option(
             ["--list-settings"], is_flag=True, is_eager=True, expose_value=False, callback=_list_settings,
-            help="Say what each named setting means.",
+            help="Name the settings --gain, --shape, ..., and end.",
         )  # fmt: skip
         *declared, more, help_option = super().get_params(ctx)
         return [*declared, hard, listing, *settings_options(), more, help_option]
@@ -208,10 +208,8 @@ class SettingsCommand(Command):
         return True
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Name the settings, with unit and default where all is wanted."""
+        """Name the settings, with unit and default, where all is wanted."""
         if not shows_all(ctx):
-            some = "--gain, --lidar-noise, --shape, ... (see --list-settings)"
-            formatter.write(f"\nNamed settings: {some}\n")
             return
         text = " ".join(f"{name}\u00a0[{default}]" for name, default in _defaults())
         lines = textwrap.wrap(text, formatter.width - 2, break_on_hyphens=False)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import click
+from click.shell_completion import CompletionItem
 
 from cosim.named_settings import NamedSettings
 from cosim.screens import option, rare
@@ -172,9 +173,27 @@ class SizeType(click.ParamType[tuple[int, int]]):
         return width, height
 
 
+class PolicyType(click.ParamType[str]):
+    """The file of a checkpoint, or the name of a pilot that needs none."""
+
+    name = "policy"
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        """Files, and the names."""
+        names = [SHIPPED_POLICY, "pure-pursuit", "lidar-rule"]
+        if param.multiple:  # in an evaluation, which tunes
+            names.append("pure-pursuit-tuned")
+        return [
+            CompletionItem(incomplete, type="file"),
+            *(CompletionItem(name) for name in names if name.startswith(incomplete)),
+        ]
+
+
 SCALE: Final = option("--scale", type=ScaleType(), metavar="F|radius=R",
-                            help="Metres in one unit of the files, or the mean radius to make it so many metres "
-                                 "[default: the unit that the file states, or metres].")  # fmt: skip
+                      help="Metres a unit of the file, or the mean radius (m).")  # fmt: skip
+POLICY_HELP: Final = "checkpoint, pure-pursuit or lidar-rule"
 AXES: Final = rare("--axes", type=click.Choice(["auto", "zup", "yup"]), default="auto", show_default=True,
                            help="Up axis of the files; auto follows the file or its format.")  # fmt: skip
 ENDS: Final = (
@@ -192,9 +211,9 @@ def _positive(ctx: click.Context, param: click.Parameter, value: float | None) -
 
 
 _FLIGHT: Final = (
-    option("--mesh", metavar="PATH", help=f"Tube mesh [default: {SHIPPED_MESH}]."),
-    option("--tube", type=TubeType(), metavar="level=L,seed=N[,length=R]",
-                 help="A generated tube: that of `cosim evaluate`."),
+    option("--mesh", type=click.Path(), metavar="PATH", help=f"Tube mesh [default: {SHIPPED_MESH}]."),
+    option("--tube", type=TubeType(), metavar="level=L,seed=N",
+                 help="A generated tube; ,length=R also says how long."),
     rare("--centerline", type=click.Path(path_type=Path), metavar="PATH", default=None,
                  help="Centreline .obj [default: <mesh stem>_centerline.obj beside the mesh, else it is found]."),
     AXES,
@@ -202,30 +221,31 @@ _FLIGHT: Final = (
     *ENDS,
     rare("--start-end", type=click.Choice(["first", "last"]), default="first", show_default=True,
                  help="End of the centreline to start from."),
-    option("--policy", metavar="PATH|pure-pursuit|lidar-rule", default=SHIPPED_POLICY, show_default=True,
-                 help="Checkpoint, or a baseline; Pure Pursuit knows the centreline."),
+    option("--policy", type=PolicyType(), metavar="P", default=SHIPPED_POLICY,
+                 help=f"Who flies: {POLICY_HELP}."),
     rare("--lookahead", type=float, callback=_positive, metavar="M",
                  help="Of Pure Pursuit (m) [default: 1; `cosim evaluate` takes the camera's 3]."),
     rare("--speed", type=float, callback=_positive, metavar="V",
                  help="Of Pure Pursuit (m/s) [default: 2]."),
-    rare("--dt", type=Fraction(), help="Control step (s) [default: the checkpoint's]."),
-    rare("--physics-dt", type=Fraction(), default=DEFAULT_PHYSICS_DT, show_default=False,
+    rare("--dt", type=Fraction(), metavar="S", help="Control step (s) [default: the checkpoint's]."),
+    rare("--physics-dt", type=Fraction(), metavar="S", default=DEFAULT_PHYSICS_DT, show_default=False,
                  help="Inner step (s); dt must be a whole multiple [default: 1/240]."),
     rare("--allow-mismatch", type=click.Choice(["dt"]), multiple=True,
                  help="Fly although this differs from the checkpoint."),
-    rare("--max-steps", type=click.IntRange(min=1, max=10**9),
+    rare("--max-steps", type=click.IntRange(min=1, max=10**9), metavar="N",
                  help="Step limit [default: 1.5 length / (slowest speed x dt)]."),
-    option("--seed", type=click.IntRange(0, 2**63 - 1), default=None, show_default=False,
-                 help="Of start, conditions, noise and gusts [default: 0, or the tube's]."),
+    option("--seed", type=click.IntRange(0, 2**63 - 1), metavar="N",
+                 help="Of start and conditions [default: 0, or the tube's]."),
     rare("--on-contact", type=click.Choice(["end", "continue"]), default="end", show_default=True,
                  help="End at the first contact, or count on."),
     option("--parameter", "parameters", multiple=True, metavar="NAME=VALUE",
                  help="Plant parameter, e.g. force_gain=2."),
     option("--realtime", type=float, callback=_positive, metavar="FACTOR",
-                 help="Pace; 1 is wall clock [default: as fast as possible]."),
-    option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [default: new]."),
-    option("--server", metavar="COMMAND", help="Start this physics peer as COMMAND RENDEZVOUS."),
-    option("--connect", metavar="RENDEZVOUS", help="Wait for a peer that you start; never kill it."),
+                 help="Pace; 1 is wall clock [default: as fast as it can]."),
+    option("--out", type=click.Path(path_type=Path), metavar="DIR",
+                 help="Run folder [default: a new one in runs/]."),
+    option("--server", metavar="COMMAND", help="Start your physics as COMMAND RENDEZVOUS."),
+    rare("--connect", metavar="RENDEZVOUS", help="Wait for a peer that you start; never kill it."),
     rare("--session", metavar="NAME", help="Name of the session [default: a new one]."),
     rare("--transport", type=click.Choice(["shm", "file"]), default="shm", show_default=True,
                  help="Shared memory, or mapped files."),
@@ -260,16 +280,15 @@ _VIEW: Final = (
                  help="Write a picture, without a window."),
     option("--movie", type=click.Path(path_type=Path), metavar="F.mp4|F.gif", help="Write a film of a run."),
     option("--figure", type=click.Path(path_type=Path), metavar="F.png",
-                 help="Write the paper's figure of a mesh: conduit and centreline in Blender and in vedo; vedo "
-                      "draws all of it."),
+                 help="Write the paper's figure, Blender's view beside ours."),
     option("--step", type=click.IntRange(min=0), metavar="K",
-                 help="Of the picture or the window's beginning [default: the middle; the beginning]."),
-    option("--camera", type=click.Choice(["overview", "follow", "inside"]),
-           help="[default: overview; of films follow]"),
-    option("--colour", "--color", "colour", type=click.Choice(["clearance", "reward", "speed"]),
-                 help="Of trajectories [default: clearance; of several runs, each its own]."),
+                 help="Where to begin; of a picture [default: the middle]."),
+    option("--camera", type=click.Choice(["overview", "follow", "inside"]), metavar="C",
+                 help="overview, follow [default of films] or inside."),
+    option("--colour", "--color", "colour", type=click.Choice(["clearance", "reward", "speed"]), metavar="C",
+                 help="clearance, reward or speed [default: each run its own]."),
     option("--realtime", type=float, callback=_positive, metavar="FACTOR", default=1.0,
-                 help="Pace of films and of playing; 1 is wall clock [default: 1]."),
+                 help="Pace; 1 is wall clock [default: 1]."),
     option("--size", type=SizeType(), default="1280x800", metavar="WxH", help="[default: 1280x800]"),
     rare("--centerline", type=click.Path(path_type=Path), metavar="PATH",
                  help="Of a mesh [default: <mesh stem>_centerline.obj beside it, else it is found]."),
@@ -281,48 +300,46 @@ _VIEW: Final = (
 
 _INSPECT: Final = (
     option("--centerline", type=click.Path(path_type=Path), metavar="PATH",
-                 help="[default: <mesh stem>_centerline.obj beside the mesh, else it is found]"),
+                 help="[default: MESH_centerline.obj beside it, else it is found]"),
     option("--entry", type=PlaceType(), metavar="N|x,y,z",
-                 help="Where it is to start: an opening's number, or a point in the file's coordinates."),
-    option("--exit", type=PlaceType(), metavar="N|x,y,z", help="Where it is to end."),
-    option("--axes", type=click.Choice(["auto", "zup", "yup"]), default="auto", show_default=True,
-                 help="Up axis of the file; auto follows the file or its format."),
+                 help="Start it there: at an opening's number, or at a point."),
+    option("--exit", type=PlaceType(), metavar="N|x,y,z", help="End it there."),
+    option("--axes", type=click.Choice(["auto", "zup", "yup"]), default="auto",
+                 help="Up axis [default: as the file or its format says]."),
     SCALE,
-    option("--body-radius", type=float, callback=_positive, default=0.15, show_default=True, metavar="R",
-                 help="Of the drone (m)."),
+    option("--body-radius", type=float, callback=_positive, default=0.15, metavar="R",
+                 help="Of the drone (m) [default: 0.15]."),
     option("--out", type=click.Path(path_type=Path), metavar="DIR",
-                 help="Write pictures, numbers, and the centreline that was found."),
+                 help="Write pictures, numbers, and the centreline found."),
 )  # fmt: skip
 
 
 _EVALUATE: Final = (
-    option("--policy", "policies", multiple=True, metavar="P",
-                 help="Checkpoint, pure-pursuit (look-ahead the camera's 3 m; in `cosim launch` 1 m), "
-                      "pure-pursuit-tuned or lidar-rule; repeatable [default: all three and tube_ppo]."),
+    option("--policy", "policies", type=PolicyType(), multiple=True, metavar="P",
+                 help="Checkpoint, or a pilot's name [default: all four]."),
     option("--levels", callback=_levels, metavar="L,L,...",
-                 help="Levels of the curriculum [default: 0,1,2; 2 for a map]."),
+                 help="Of the curriculum [default: 0,1,2; 2 for a map]."),
     option("--episodes", type=click.IntRange(1, 1_000_000), metavar="N",
                  help="Tubes a level [default: 100; 40 a cell of a map]."),
-    option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True,
-                 help="Of tubes, starts and conditions; training sees none of them."),
-    option("--dynamics", type=click.Choice(["kinematic", "rigid-body"]),
-                 help="World [default: kinematic]."),
-    option("--engine", type=click.Choice(["bullet", "reference"]),
-                 help="Of rigid bodies: a PyBullet server, or in process [default: bullet]."),
+    option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, metavar="N",
+                 help="Of tubes that training never sees [default: 0]."),
+    option("--dynamics", type=click.Choice(["kinematic", "rigid-body"]), metavar="WORLD",
+                 help="kinematic [default] or rigid-body."),
+    option("--engine", type=click.Choice(["bullet", "reference"]), metavar="ENGINE",
+                 help="Of rigid bodies, bullet [default] or reference."),
     rare("--tuning-episodes", type=click.IntRange(5, 100_000), metavar="N",
                  help="Tubes that tune Pure Pursuit [default: 100; 40 a cell of a map]."),
-    option("--sweep", metavar="NAME=V1,V2,...", help="Evaluate for each value of one named setting."),
+    option("--sweep", metavar="NAME=V1,V2,...", help="Evaluate each value of one named setting."),
     option("--map", "draw_map", is_flag=True,
-                 help="Draw success over gain and compensation in place of the table [--dynamics rigid-body, "
-                      "--engine reference]."),
+                 help="Draw success over gain and compensation."),
     rare("--map-gains", callback=_numbers, metavar="G,G,...",
                  help="Columns of the map (1/s) [default: 1,1.5,2,3,4,6,8]."),
     rare("--map-compensations", callback=_numbers, metavar="C,C,...",
                  help="Rows of the map (weight) [default: 0.7,0.8,0.9,1,1.1]."),
     option("--workers", type=click.IntRange(1, 512), metavar="N",
-                 help="Processes that fly; results do not depend on it [default: the cores]."),
+                 help="Processes; change no result [default: the cores]."),
     option("--out", type=click.Path(path_type=Path), metavar="DIR",
-                 help="Write results.json with every episode, and the map."),
+                 help="Write results.json with every episode; the map."),
 )  # fmt: skip
 
 

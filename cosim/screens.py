@@ -1,9 +1,10 @@
-"""Help that fits on a screen: commands show what is often needed, and all the rest with --help-all."""
+"""Help that fits on a screen of 24 lines: commands show what is often needed, and all the rest with --help-all."""
 
 from __future__ import annotations
 
 import math
 from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 import click
@@ -37,6 +38,21 @@ class FiniteRange(click.FloatRange):
         return number
 
 
+class OutputFile(click.Path):
+    """A file to write; refused before any work where it is a folder, or where there is no folder to write it to."""
+
+    def __init__(self) -> None:
+        super().__init__(dir_okay=False, writable=True, path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Look at its folder."""
+        path = super().convert(value, param, ctx)
+        assert isinstance(path, Path)
+        if not path.parent.is_dir():
+            self.fail(f"{path}: expected a folder {path.parent} to write it to, found none", param, ctx)
+        return path
+
+
 class Rare(Option):
     """An option that only --help-all shows."""
 
@@ -47,6 +63,16 @@ class Rare(Option):
 
 class Command(click.Command):
     """A command with --help-all where it has options that --help leaves out."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Refuse an empty value, which is what a shell makes of a variable that is not set: a path would be "."."""
+        if not ctx.resilient_parsing:
+            for before, word in zip(["", *args], args, strict=False):
+                if not word or (word.startswith("--") and word.endswith("=")):
+                    name = word.rstrip("=") or before
+                    option = f"{name}: " if name.startswith("-") else ""
+                    raise click.UsageError(f"{option}expected a value, found an empty string", ctx)
+        return super().parse_args(ctx, args)
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         """The declared options, then the two helps."""

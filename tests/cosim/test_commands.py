@@ -8,11 +8,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from click.shell_completion import ShellComplete
 from click.testing import CliRunner
 from flights import DEADLINE, command, environment, run_cosim, run_here
 
 from cosim import __version__
 from cosim.cli import cosim
+from cosim.evaluation_plan import POLICIES
+from cosim.pilots import TUNED_PURSUIT
 
 ROUND_TRIPS = {"shm_two_cores", "shm_one_core", "pipe", "udp", "udp_one_core"}
 QUANTILES = {"p50_us", "p99_us", "p999_us"}
@@ -21,13 +24,13 @@ PHASES = {"wait", "physics", "rays", "features", "policy", "recording", "other"}
 
 @pytest.mark.parametrize("name", ["", *cosim.commands])
 def test_help_fits_on_a_screen(name: str) -> None:
-    """Every command's help fits on 80 columns and 40 lines and shows an example; --help-all may be longer."""
+    """Every command's help fits on 80 columns and 24 lines, the prompt's included, and shows an example."""
     done = CliRunner().invoke(cosim, [*name.split(), "--help"], prog_name="cosim", terminal_width=80)
     assert done.exit_code == 0
     lines = done.stdout.splitlines()
     assert lines[0].startswith(f"Usage: cosim {name}".strip())
-    assert len(lines) <= 40
-    assert max(map(len, lines)) <= 88  # an example may be a little wider
+    assert len(lines) <= 23
+    assert max(map(len, lines)) <= 80
     assert any(line.strip().startswith(("cosim", "eval")) and name in line for line in lines[1:])
 
 
@@ -58,6 +61,44 @@ def test_the_shells_complete_commands(shell: str, tmp_path: Path) -> None:
     )  # fmt: skip
     assert "export" in answer.stdout
     assert "launch" not in answer.stdout
+
+
+def test_policies_complete_to_files_and_names() -> None:
+    """Names of pilots that need no file, those that are there to be flown, and the shell's files."""
+    for command_name, pilots in (("launch", set(POLICIES) - {TUNED_PURSUIT}), ("evaluate", set(POLICIES))):
+        completion = ShellComplete(cosim, {}, "cosim", "_COSIM_COMPLETE")
+        items = completion.get_completions([command_name, "--policy"], "")
+        assert {item.value for item in items if item.type == "plain"} == pilots
+        assert [item.value for item in items if item.type == "file"] == [""]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        (("launch", "--mesh", ""), "--mesh: "),
+        (("launch", "--out="), "--out: "),
+        (("verify", ""), ""),
+        (("export", "run", "--format", "csv", "-o", ""), "-o: "),
+    ],
+)
+def test_an_empty_value_is_refused(arguments: tuple[str, ...], name: str) -> None:
+    """What a shell makes of a variable that is not set is no path and no default."""
+    done = run_here(*arguments)
+    assert done.status == 2
+    assert f"Error: {name}expected a value, found an empty string" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments", [("report", "run"), ("export", "run", "--format", "csv"), ("bench", "--protocol")]
+)
+def test_a_file_is_refused_before_the_work(arguments: tuple[str, ...], tmp_path: Path) -> None:
+    """A folder in its place, or no folder to write it to, is said before anything is read or measured."""
+    option = "--png" if arguments[0] == "bench" else "--out"
+    (tmp_path / "file").touch()
+    done = run_here(*arguments, option, str(tmp_path / "file" / "x"))
+    assert (done.status, "expected a folder" in done.stderr) == (2, True)
+    done = run_here(*arguments, option, str(tmp_path))
+    assert (done.status, "is a directory" in done.stderr) == (2, True)
 
 
 def test_the_version_is_told() -> None:
