@@ -15,10 +15,10 @@ VIEW_ANGLE: Final = 30.0
 INSIDE_ANGLE: Final = 75.0
 """Of what is seen inside of a tube."""
 UP: Final = np.array([0.0, 0.0, 1.0])
-SIDE_MARGIN: Final = 0.11
+SIDE_MARGIN: Final = 0.12
 TOP_MARGIN: Final = 0.17
 BOTTOM_MARGIN: Final = 0.1
-"""Shares of the picture that an overview keeps free; texts stand at the top."""
+"""Shares of the picture that an overview keeps free; texts stand at the top, a scale at the right."""
 POINTS: Final = 1500
 """Of a tube, by which it is framed."""
 

@@ -23,6 +23,7 @@ from typing import IO, Any, Final, Self
 
 import protocol
 from agent_client.settings import Settings
+from cosim.live import working
 from cosim.senses import Sensors
 from protocol.liveness import describe_exit
 
@@ -135,7 +136,9 @@ class LiveView:
             self._say(f"live view: cannot be started: {error.strerror}; the flight goes on without it")
             return
         assert self._process.stdout is not None
-        if not select.select([self._process.stdout], [], [], READY_S)[0]:
+        with working("opening the window"):
+            answers = select.select([self._process.stdout], [], [], READY_S)[0]
+        if not answers:
             self._say(
                 f"live view: no picture within {READY_S:g} s; the flight goes on, and it may come later"
             )

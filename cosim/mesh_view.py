@@ -134,7 +134,7 @@ def draw_figure(mesh: ViewedMesh, size: tuple[int, int], open_stage: Callable[..
         ViewError: the mesh has no centreline.
     """
     if mesh.axis is None:
-        raise ViewError(f"--figure: expected a mesh with a centreline; {mesh.note}")
+        raise ViewError("--figure: expected a mesh with a centreline, found none")
     width, height = size[0] // 2, size[1] // 2
     camera = overview(mesh.surface.vertices, width / height)
     panels = []
@@ -163,7 +163,7 @@ def _camera(mesh: ViewedMesh, view: View, size: tuple[int, int]) -> Camera:
     if view == "overview":
         return overview(mesh.surface.vertices, size[0] / size[1])
     if mesh.axis is None or mesh.radius is None:
-        raise ViewError(f"--camera {view}: expected a centreline to look along; {mesh.note}")
+        raise ViewError(f"--camera {view}: expected a centreline to look along, found none")
     i = len(mesh.axis) // 2
     tangent = mesh.axis[min(i + 1, len(mesh.axis) - 1)] - mesh.axis[max(i - 1, 0)]
     tangent /= np.linalg.norm(tangent)

@@ -13,7 +13,7 @@ import click
 from cosim import interrupts
 from cosim.errors import NoDisplayError, ViewError
 from cosim.film import INSTALL, check_outputs, write_film, write_picture
-from cosim.live import counting
+from cosim.live import counting, working
 from cosim.mesh_view import MeshChoice, draw_figure, put_up_mesh
 from cosim.options import SHIPPED_MESH
 from cosim.playback import Playback, View
@@ -83,7 +83,9 @@ def view(options: ViewOptions) -> None:
         raise ViewError("expected run folders or one mesh, found both")
     try:
         if runs:
-            _view_runs(options, read_tracks(runs))
+            with working("reading the runs" if len(runs) > 1 else "reading the run"):
+                tracks = read_tracks(runs)
+            _view_runs(options, tracks)
         else:
             _view_mesh(options)
     except NoDisplayError as error:
@@ -125,7 +127,8 @@ def _view_runs(options: ViewOptions, tracks: tuple[Track, ...]) -> None:
         options.size, offscreen=options.offscreen, title=f"cosim view - {tracks[0].run.folder}"
     )
     try:
-        playback = Playback(stage, tracks, colour=options.colour, view=options.camera or "overview")
+        with working("building the scene"):
+            playback = Playback(stage, tracks, colour=options.colour, view=options.camera or "overview")
         if options.step is not None and options.step > playback.last:
             raise ViewError(f"--step: expected 0 to {playback.last}, found {options.step}")
         if options.screenshot is not None:
@@ -171,16 +174,20 @@ def _view_mesh(options: ViewOptions) -> None:
     path = INDUSTRIAL if str(named[0]) == SHIPPED_MESH and not named[0].is_file() else named[0]
     if not path.is_file():
         raise ViewError(f"{path}: expected a run folder or the file of a mesh, found neither")
-    tube = options.mesh.read(path)
+    with working(f"reading {path.name}"):
+        tube = options.mesh.read(path)
     if tube.note:
         click.echo(tube.note, err=True)
     if options.figure is not None:
-        _written(options.figure, draw_figure(tube, options.size, open_stage))
+        with working("drawing the figure"):
+            figure = draw_figure(tube, options.size, open_stage)
+        _written(options.figure, figure)
     if options.screenshot is None and options.figure is not None:
         return
     stage = open_stage(options.size, offscreen=options.offscreen, title=f"cosim view - {path.name}")
     try:
-        put_up_mesh(stage, tube, options.camera or "overview")
+        with working("building the scene"):
+            put_up_mesh(stage, tube, options.camera or "overview")
         if options.screenshot is not None:
             _written(options.screenshot, stage.picture())
         else:
