@@ -12,6 +12,7 @@ import pytest
 from flights import Done, run_here
 from pages import PageData, copy_run, evaluation_results, read_page
 
+from cosim.errors import OutputError
 from cosim.recording import LOG, MANIFEST
 from cosim.report import PAGE, report
 from cosim.report_axis import curvature_along
@@ -277,4 +278,6 @@ def test_the_page_never_replaces_the_data(conduit_run: tuple[Done, Path], tmp_pa
     assert (run / LOG).read_bytes() == before
     done = run_here("report", str(run), "--out", str(tmp_path / "none" / "page.html"))
     assert done.status == 2
-    assert "cannot be written: No such file or directory" in done.stderr
+    assert f"expected a folder {tmp_path / 'none'} to write it to, found none" in done.stderr
+    with pytest.raises(OutputError, match="cannot be written: No such file or directory"):
+        report([run], tmp_path / "none" / "page.html")
