@@ -20,14 +20,15 @@ from typing import Final
 import numpy as np
 
 from meshes.centring import centre_path, to_the_end
-from meshes.closest import build_tree, wall_distance
+from meshes.closest import distances_to_wall
 from meshes.curves import arc_lengths
 from meshes.errors import CentrelineError
-from meshes.geometry import Floats
+from meshes.geometry import Bools, Floats
 from meshes.lumen import Balls, draw_balls, shortest_way
 from meshes.openings import Opening
 from meshes.sections import measure_rings, resample_evenly
 from meshes.swept import unit_tangents
+from meshes.tube import WIDEST_JOINT
 from meshes.tube_ends import NEAR, Place, choose_ends, choose_lumen, refuse_more_tubes
 from meshes.wall import Wall, in_units, place
 
@@ -40,6 +41,12 @@ LEAST_CLEARANCE: Final = 0.15
 MOST_OPEN: Final = 1.0 / 6.0
 """Fraction of a section that may be open, for longer than `LONGEST_OPEN` radii."""
 LONGEST_OPEN: Final = 2.0
+BARE: Final = 0.5
+"""Fraction of a section from which on it has no wall: there the parts of a tube do not meet."""
+LEAST_AT_ENDS: Final = 0.55
+"""Fraction of a section at an end that must have a wall."""
+BARE_ENDS: Final = 0.2
+"""Share of a centreline that may be cut off since it has too few walls around it."""
 
 
 @dataclass(frozen=True)
@@ -82,12 +89,14 @@ def find_centreline(wall: Wall, entry: Place | None = None, exit: Place | None =
     choice = choose_lumen(wall, balls, [np.asarray(point, dtype=np.float64) for point in named])
     lumen, others, openings, holes = choice
     if entry is None or exit is None:
-        refuse_more_tubes(wall, lumen, others, openings)
+        refuse_more_tubes(wall, lumen, others, openings, holes)
     ends = choose_ends(wall, lumen, openings, entry, exit)
     way = shortest_way(lumen, *ends)
     points, capped = _centre(wall, lumen.balls.take(way), openings, (entry, exit))
-    radius = _check_room(wall, points)
+    dense, distances = _clearances(wall, points)
+    radius = float(np.median(distances))
     notes = _open_places(wall, points, radius) + _notes(wall, holes)
+    _refuse_pinched(wall, dense, distances)
     used = _used(openings, points, radius, capped)
     return FoundCentreline(points, radius, tuple(openings), used, capped, notes)
 
@@ -107,23 +116,37 @@ def _centre(
     points = centre_path(wall.scene, way.centres, way.radii, mouths)
     capped = [False, False]
     for end in (1, 0):  # the end, then, turned round, the start
-        longer, capped[end] = to_the_end(wall.scene, points, mouths[end] is not None)
+        mouth = mouths[end]
+        outward = mouth if end or mouth is None else -mouth
+        longer, capped[end] = to_the_end(wall.scene, points, outward)
         at = named[end]
         if at is not None and not isinstance(at, int):
             before = float(np.linalg.norm(longer[-1] - np.asarray(at, dtype=np.float64)))
             if before > AT_THE_END * way.radii[-end]:
                 longer, capped[end] = points, False
         points = longer[::-1]
+    points = _within_walls(wall, points)
     return resample_evenly(points, EVEN_STEP * float(np.quantile(way.radii, 0.2))), (capped[0], capped[1])
 
 
-def _check_room(wall: Wall, points: Floats) -> float:
-    """The median distance of the wall (m); refuses a place that has much less."""
-    tree = build_tree(wall.vertices, wall.faces)
+def _within_walls(wall: Wall, points: Floats) -> Floats:
+    """Points (P, 3) without those at either end that have too few walls around them, as in a gutter behind a tube."""
+    between = 0.5 * (points[1:] + points[:-1])  # the very ends may pass the rim
+    enough = np.flatnonzero(measure_rings(wall.scene, between, unit_tangents(between)).hits >= LEAST_AT_ENDS)
+    if len(between) - len(enough) > BARE_ENDS * len(between):
+        return points
+    return points[enough[0] : enough[-1] + 2]
+
+
+def _clearances(wall: Wall, points: Floats) -> tuple[Floats, Floats]:
+    """Points (M, 3) densely along a centreline (P, 3), and their distances to the wall (m), (M,)."""
     spacing = float(np.linalg.norm(points[1] - points[0]))
-    dense = np.ascontiguousarray(resample_evenly(points, spacing / 4.0))
-    distances = np.empty(len(dense))
-    wall_distance(dense, tree.boxes, tree.triangles, np.full(len(dense), -1, dtype=np.int64), distances)
+    dense = resample_evenly(points, spacing / 4.0)
+    return dense, distances_to_wall(dense, wall.vertices, wall.faces)
+
+
+def _refuse_pinched(wall: Wall, dense: Floats, distances: Floats) -> None:
+    """Refuse a place with much less room than is usual; points (M, 3) with their distances to the wall (m), (M,)."""
     usual = float(np.median(distances))
     i = int(np.argmin(distances))
     if distances[i] < LEAST_CLEARANCE * usual:
@@ -131,7 +154,6 @@ def _check_room(wall: Wall, points: Floats) -> float:
             f"{wall.path}: expected a free way, found the tube pinched at {place(wall, dense[i])}: "
             f"{in_units(wall, distances[i])} to the wall, where {in_units(wall, usual)} are usual"
         )
-    return usual
 
 
 def _open_places(wall: Wall, points: Floats, radius: float) -> tuple[str, ...]:
@@ -142,15 +164,33 @@ def _open_places(wall: Wall, points: Floats, radius: float) -> tuple[str, ...]:
     is_open = inner & (1.0 - rings.hits > MOST_OPEN)
     if not is_open.any():
         return ()
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], is_open.astype(np.int8), [0]])))
-    runs = edges.reshape(-1, 2)
-    first, stop = runs[np.argmax(along[runs[:, 1] - 1] - along[runs[:, 0]])]
+    first, stop = _longest(is_open, along)
     where = f"from {place(wall, points[first])} to {place(wall, points[stop - 1])}"
     if along[stop - 1] - along[first] > LONGEST_OPEN * radius:
         raise CentrelineError(
             f"{wall.path}: expected walls all around, found the tube open along its side {where}, as a half-pipe is"
         )
-    return (f"the wall is open to the side {where}",)
+    bare = inner & (1.0 - rings.hits > BARE)
+    if not bare.any():
+        return (f"the wall is open to the side {where}",)
+    first, stop = _longest(bare, along)
+    at = place(wall, points[(first + stop - 1) // 2])
+    if along[stop - 1] - along[first] > WIDEST_JOINT * radius:
+        raise CentrelineError(
+            f"{wall.path}: expected one tube, found parts of it that do not meet near {at}, where nothing is around "
+            f"for {in_units(wall, float(along[stop - 1] - along[first]))}; close the gap"
+        )
+    joints = int((np.diff(bare.astype(np.int8)) > 0).sum())
+    others = f", and in {joints - 1} other places" if joints > 1 else ""
+    return (f"the wall is open all around at {at}{others}: parts of the tube do not meet",)
+
+
+def _longest(chosen: Bools, along: Floats) -> tuple[int, int]:
+    """First point of the longest run of chosen ones (M,), and the one behind its last, by arc length (M,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(np.int8), [0]])))
+    runs = edges.reshape(-1, 2)
+    first, stop = runs[np.argmax(along[runs[:, 1] - 1] - along[runs[:, 0]])]
+    return int(first), int(stop)
 
 
 def _used(

@@ -133,14 +133,15 @@ def _respace(points: Floats, radii: Floats) -> tuple[Floats, Floats]:
     return spaced, np.interp(wanted, along, radii)
 
 
-def to_the_end(scene: RayScene, points: Floats, is_open: bool) -> tuple[Floats, bool]:
+def to_the_end(scene: RayScene, points: Floats, mouth: Floats | None) -> tuple[Floats, bool]:
     """Prolong some points (M, 3), `STEP` radii apart, to the mouth of the tube, or up to its cap.
 
     It grows by one step at a time, and its last part is centred anew after each, so that it follows a bend.
 
     Args:
         points: centred, the last one near the end.
-        is_open: whether the tube is known to open there: then a wall ahead is that of a bend.
+        mouth: unit vector (3,) out of the tube there; None where none is known to open. A wall ahead of a mouth is
+            that of a bend.
 
     Returns:
         All points, and whether there is a cap.
@@ -155,7 +156,7 @@ def to_the_end(scene: RayScene, points: Floats, is_open: bool) -> tuple[Floats, 
         typical = close_sideways(rings.distances, STEP)[-1]
         radius = float(typical.mean())
         free = float(wall_ahead(scene, tail[-1:], tangents[-1:])[0])
-        if not is_open and free < FREE_BEFORE_CAP * radius:
+        if mouth is None and free < FREE_BEFORE_CAP * radius:
             return points, True
         # Straight ahead as far as a bend does not matter: there may be the mouth.
         ahead = np.linspace(0.0, LOOK_AHEAD * radius, 21)[1:, None] * tangents[-1] + tail[-1]
@@ -166,16 +167,16 @@ def to_the_end(scene: RayScene, points: Floats, is_open: bool) -> tuple[Floats, 
         if not inside.all() and not scene.blocked(tail[-1:], ahead[[int(np.argmin(inside))]])[0]:
             return np.concatenate([points, ahead[: int(np.argmin(inside))][-1:]]), False
         points = np.concatenate([points, tail[-1:] + STEP * radius * tangents[-1:]])
-        if is_open or free > STRAIGHT * radius:
-            points = np.concatenate([points[:-TAIL], _settle(scene, points[-TAIL:])])
+        if mouth is not None or free > STRAIGHT * radius:
+            points = np.concatenate([points[:-TAIL], _settle(scene, points[-TAIL:], mouth)])
     return points, False
 
 
-def _settle(scene: RayScene, tail: Floats) -> Floats:
-    """The last points (T, 3) of a path, the second half of them centred."""
+def _settle(scene: RayScene, tail: Floats, mouth: Floats | None) -> Floats:
+    """The last points (T, 3) of a path, the second half of them centred; `mouth` as in `to_the_end`."""
     fixed = len(tail) // 2
     for _ in range(TAIL_ROUNDS):
-        rings = measure_rings(scene, tail, _tangents(tail))
+        rings = measure_rings(scene, tail, _held_tangents(tail, (None, mouth)))
         offsets = offsets_of_centres(rings, close_sideways(rings.distances, STEP))
         offsets[:fixed] = 0.0
         tail = _keep_free(scene, tail, tail + GAIN * offsets)

@@ -37,6 +37,15 @@ def build_tree(vertices: Floats, faces: NDArray[np.int32]) -> WallTree:
     return WallTree(boxes, triangles)
 
 
+def distances_to_wall(points: Floats, vertices: Floats, faces: NDArray[np.int32]) -> Floats:
+    """Distance (M,) of points (M, 3) to the nearest of triangles of vertices (V, 3), faces (F, 3)."""
+    tree = build_tree(vertices, faces)
+    distances = np.empty(len(points))
+    nearest = np.full(len(points), -1, dtype=np.int64)
+    wall_distance(np.ascontiguousarray(points), tree.boxes, tree.triangles, nearest, distances)
+    return distances
+
+
 def _morton(points: Floats) -> NDArray[np.uint64]:
     """Codes (F,) that order points (F, 3) along a curve on which neighbours stay close."""
     low = points.min(axis=0)

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from meshes.centring import wall_ahead
-from meshes.closest import build_tree, wall_distance
+from meshes.closest import distances_to_wall
 from meshes.curves import arc_lengths
 from meshes.errors import CentrelineError
 from meshes.geometry import Floats
@@ -142,11 +142,7 @@ def measure_profile(tube: Tube) -> Profile:
 
 def clearance_of(wall: Wall, points: Floats) -> Floats:
     """Distance from points (M, 3) to the nearest wall (m), (M,)."""
-    tree = build_tree(wall.vertices, wall.faces)
-    distances = np.empty(len(points))
-    nearest = np.full(len(points), -1, dtype=np.int64)
-    wall_distance(np.ascontiguousarray(points), tree.boxes, tree.triangles, nearest, distances)
-    return distances
+    return distances_to_wall(points, wall.vertices, wall.faces)
 
 
 def curvature_and_torsion(points: Floats, step: float, radius: float) -> tuple[Floats, Floats]:

@@ -25,6 +25,9 @@ Ints = NDArray[np.int64]
 
 CHORDS: Final = 20_000
 """Points of the wall from which chords are cast, to both sides."""
+SLANTED: Final = 0.5
+"""Share of the chords that leave the wall in any direction, and not along its normal: the normals of a star's
+corners all miss its middle."""
 LOOKS: Final = 42
 """Directions in which a ball looks around."""
 FEW_LOOKS: Final = 26
@@ -40,6 +43,8 @@ SPACING: Final = 0.5
 """Side of the cells that hold one ball each, over the power of 2 at or below the radius."""
 NEIGHBOURS: Final = 16
 """Balls that each is joined with at most, of its own choice."""
+LARGER: Final = 2
+"""Larger ones that each is joined with at most."""
 TOUCH: Final = 1.2
 """Balls are joined up to this distance, over the sum of their radii."""
 BAND: Final = 0.2
@@ -199,6 +204,11 @@ def _middles_of_chords(scene: RayScene, vertices: Floats, faces: NDArray[np.int3
     off = 3e-6 * float(np.linalg.norm(np.ptp(vertices, axis=0)))  # beyond what single precision confuses
     origins = np.concatenate([points + off * normals, points - off * normals])
     directions = np.concatenate([normals, -normals])
+    aside = rng.normal(size=directions.shape)
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    slanted = rng.random(len(directions)) < SLANTED
+    directions[slanted] += aside[slanted]  # by Lambert's law
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     chords = scene.distances(origins, directions, np.inf)
     ended = np.isfinite(chords) & (chords > 10.0 * off)
     middles: Floats = origins[ended] + 0.5 * chords[ended, None] * directions[ended]
@@ -215,9 +225,13 @@ def _apart_from(scene: RayScene, small: Balls, large: Balls) -> Ints:
     """Indices of the small balls that are not in the corners of the space that the large ones fill."""
     if not len(small):
         return np.empty(0, dtype=np.int64)
+    # A small tube in a hall is missed by most looks of a large ball, but the wall around a small ball is near.
+    distance, nearest = cKDTree(small.centres).query(large.centres, k=min(4, len(small)))
+    distance, nearest = distance.reshape(len(large), -1), nearest.reshape(len(large), -1)
+    radii = np.minimum(large.radii, (distance + small.radii[nearest]).min(axis=1))
     distance, nearest = cKDTree(large.centres).query(small.centres, k=min(4, len(large)))
     distance, nearest = distance.reshape(len(small), -1), nearest.reshape(len(small), -1)
-    beside = distance < small.radii[:, None] + large.radii[nearest]
+    beside = distance < small.radii[:, None] + radii[nearest]
     ball, k = np.nonzero(beside)
     beside[ball, k] = ~scene.blocked(small.centres[ball], large.centres[nearest[ball, k]])
     return np.flatnonzero(~beside.any(axis=1))
@@ -235,9 +249,11 @@ def _thin(balls: Balls) -> Balls:
 def _join(scene: RayScene, balls: Balls) -> tuple[csr_array, csr_array]:
     """Lengths and clearances of the ways between balls that touch, (N, N), upper triangle."""
     count, centres, radii = len(balls), balls.centres, balls.radii
-    distance, other = cKDTree(centres).query(centres, k=min(NEIGHBOURS + 1, count))
+    other = cKDTree(centres).query(centres, k=min(NEIGHBOURS + 1, count))[1]
     pairs = np.sort(np.stack([np.repeat(np.arange(count), other.shape[-1]), other.ravel()], axis=1), axis=1)
-    near = (pairs[:, 0] != pairs[:, 1]) & (distance.ravel() < TOUCH * radii[pairs].sum(axis=1))
+    pairs = np.concatenate([pairs, _with_larger(balls)])
+    distance = np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1)
+    near = (pairs[:, 0] != pairs[:, 1]) & (distance < TOUCH * radii[pairs].sum(axis=1))
     i, j = np.unique(pairs[near], axis=0).T
     seen = ~scene.blocked(centres[i], centres[j])
     i, j = i[seen], j[seen]
@@ -250,6 +266,18 @@ def _join(scene: RayScene, balls: Balls) -> tuple[csr_array, csr_array]:
         csr_array((length, (i, j)), shape=(count, count)),
         csr_array((clear, (i, j)), shape=(count, count)),
     )
+
+
+def _with_larger(balls: Balls) -> Ints:
+    """Pairs (K, 2) of balls with the nearest of those larger by a level of cells, which their like may hide."""
+    level = np.floor(np.log2(balls.radii))
+    pairs = [np.empty((0, 2), dtype=np.int64)]
+    for lower in np.unique(level)[:-1]:
+        small, large = np.flatnonzero(level == lower), np.flatnonzero(level > lower)
+        nearest = cKDTree(balls.centres[large]).query(balls.centres[small], k=min(LARGER, len(large)))[1]
+        nearest = nearest.reshape(len(small), -1)
+        pairs.append(np.stack([np.repeat(small, nearest.shape[1]), large[nearest.ravel()]], axis=1))
+    return np.sort(np.concatenate(pairs), axis=1)
 
 
 def _measure(scene: RayScene, balls: Balls, lengths: csr_array, clearances: csr_array) -> Lumen | None:

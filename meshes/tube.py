@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from meshes.centreline import parse_centreline, resample
 from meshes.errors import CentrelineError
 from meshes.formats import Axes, AxesChoice
-from meshes.geometry import Floats
+from meshes.geometry import Bools, Floats
 from meshes.obj import read_bytes
 from meshes.scale import MeanRadius
 from meshes.wall import Wall, read_wall, to_world
@@ -37,6 +37,8 @@ RING = 36
 LEAST_HITS = RING // 2 + 1
 """Rays of a ring that must meet a wall: from outside of a convex wall fewer than half of them can. The rest may
 leave through a side opening, or near an end through a mouth that is not square to the centreline."""
+WIDEST_JOINT = 1.0
+"""Fewer may meet one where segments of a tube leave a gap between them, up to so many radii long."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +241,8 @@ def _local_radius(tube: Tube) -> Floats:
     whole neighbours, since the rays that remain would favour one side.
 
     Raises:
-        CentrelineError: a point has too few walls around it, or a wall lies between neighbouring points.
+        CentrelineError: a point has too few walls around it, and does not stand in a joint, or a wall lies between
+            neighbouring points.
     """
     origins = tube.axis.copy()
     # At the very ends half of the rays could pass the rim: look from half a step inside.
@@ -254,7 +257,8 @@ def _local_radius(tube: Tube) -> Floats:
     hits = hit.sum(axis=1)
     crossed = np.zeros(len(hits), dtype=bool)
     crossed[1:] = tube.wall.scene.blocked(tube.axis[:-1], tube.axis[1:])
-    wrong = (hits < LEAST_HITS) | crossed
+    bare = hits < LEAST_HITS
+    wrong = crossed | (bare & ~_in_joints(tube, bare, hits == RING, distances))
     if wrong.any():
         i = int(np.argmax(wrong))
         found = f"{RING - hits[i]} of {RING} rays around it that meet no wall"
@@ -265,11 +269,24 @@ def _local_radius(tube: Tube) -> Floats:
             f"arc length {tube.arc_length[i]:.2f} m of {tube.length:.2f} m {found}; "
             f"{wrong.sum()} of {len(wrong)} points are wrong: check that both files have the same axes and unit"
         )
-    radius = np.where(hit, distances, 0.0).sum(axis=1) / hits
+    radius = np.where(hit, distances, 0.0).sum(axis=1) / np.maximum(hits, 1)
     whole = hits == RING
     if whole.any():
         radius = np.interp(tube.arc_length, tube.arc_length[whole], radius[whole])
     return radius  # type: ignore[no-any-return]
+
+
+def _in_joints(tube: Tube, bare: Bools, whole: Bools, distances: Floats) -> Bools:
+    """Which of the bare points (M,) stand in a short gap between two segments of the tube, (M,)."""
+    in_joints = np.zeros(len(bare), dtype=bool)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], bare.astype(np.int8), [0]])))
+    for first, stop in edges.reshape(-1, 2):
+        before, behind = np.flatnonzero(whole[:first])[-1:], stop + np.flatnonzero(whole[stop:])[:1]
+        if not (len(before) and len(behind)):
+            continue
+        gap = tube.arc_length[behind[0]] - tube.arc_length[before[0]] - tube.step
+        in_joints[first:stop] = gap <= WIDEST_JOINT * distances[[before[0], behind[0]]].mean()
+    return in_joints
 
 
 def _ring(tangent: Floats) -> Floats:

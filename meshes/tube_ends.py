@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree  # type: ignore[import-untyped]
 from meshes.curves import arc_lengths
 from meshes.errors import CentrelineError, EndsError
 from meshes.geometry import Bools, Floats
-from meshes.lumen import BANDS, ENCLOSED, Balls, Lumen, find_lumens, furthest_ball, shortest_way
+from meshes.lumen import BANDS, ENCLOSED, Balls, Ints, Lumen, find_lumens, furthest_ball, shortest_way
 from meshes.openings import Opening, find_openings
 from meshes.wall import Wall, in_units, place
 
@@ -26,34 +26,54 @@ NEAR: Final = 3.0
 """A point that is named may lie so many radii from the nearest ball, and an end so many from its opening."""
 BEHIND_WALL: Final = 0.5
 """A point that is named may lie behind a wall so many radii from the nearest ball."""
+FACING: Final = 0.7
+"""Cosine of the angle up to which an opening faces another tube."""
 HOLLOW: Final = 4.5
-"""A closed space whose length is less than so many of its largest radii is no tube."""
+"""A space with one opening or none whose length is less than so many of its largest radii is no tube."""
 LOOP: Final = 1.5
 """A second way between the ends no longer than so many times the first makes a loop of a space without openings."""
+FAR: Final = 3.0
+WIDE: Final = 0.2
+"""A space is wide where such a share of its balls lies more than so many radii from a way through it, in sight."""
 TWIN: Final = 1.5
 """A second way keeps so many radii from the middle of the first."""
 
 
-def choose_lumen(
-    wall: Wall, balls: Balls, named: list[Floats]
-) -> tuple[Lumen, list[Lumen], list[Opening], list[Opening]]:
+_Choice = tuple[Lumen, list[Lumen], list[Opening], list[Opening]]
+
+
+def choose_lumen(wall: Wall, balls: Balls, named: list[Floats]) -> _Choice:
     """The space to fly through, the other tubes of its size, and its openings and holes.
 
-    The named points lie in it; without any it is no closed hollow.
+    The named points lie in it; without any it is no closed hollow, and no hall around a tube that opens into it.
     """
     largest: list[Lumen] = []
+    closed: _Choice | None = None
     for band in range(BANDS):
         lumens = find_lumens(wall.scene, balls, band)
         largest = largest or lumens
         for lumen in lumens:
             if not all(_ball_at(wall, lumen, point) is not None for point in named):
                 continue
+            if largest is not lumens and not named and not _is_tube_in(lumen, largest):
+                continue
             openings, holes = find_openings(wall.scene, lumen)
-            if named or openings or lumen.length > HOLLOW * lumen.balls.radii.max():
-                return lumen, [other for other in lumens if other is not lumen], openings, holes
+            choice = lumen, [other for other in lumens if other is not lumen], openings, holes
+            long = lumen.length > HOLLOW * lumen.balls.radii.max()
+            if named or len(openings) > 1 or (openings and long):
+                return choice
+            closed = closed or (choice if long else None)
+    if closed is not None:
+        return closed
     if not (largest and named):
         raise CentrelineError(_no_tube(wall, balls))
     raise CentrelineError(_not_between(wall, largest, named))
+
+
+def _is_tube_in(lumen: Lumen, larger: list[Lumen]) -> bool:
+    """Whether a space is more than a crevice of larger ones: long, or a tube in a hall."""
+    hall = max(larger, key=lambda hall: hall.length)
+    return lumen.length >= COMPARABLE * hall.length or (lumen.sealed and lumen.depth > hall.depth)
 
 
 def _no_tube(wall: Wall, balls: Balls) -> str:
@@ -92,25 +112,47 @@ def _not_between(wall: Wall, lumens: list[Lumen], named: list[Floats]) -> str:
     )
 
 
-def refuse_more_tubes(wall: Wall, lumen: Lumen, others: list[Lumen], openings: list[Opening]) -> None:
+def refuse_more_tubes(
+    wall: Wall, lumen: Lumen, others: list[Lumen], openings: list[Opening], holes: list[Opening]
+) -> None:
     """Refuse where another space is as likely to be meant, or is the other half of a blocked tube."""
-    for other in others:
-        if other.depth < lumen.depth or other.length < COMPARABLE * lumen.length:
-            continue
-        if not 0.5 < other.radius / lumen.radius < 2.0:
-            continue
-        apart, j = cKDTree(other.balls.centres).query(lumen.balls.centres)
-        i = int(np.argmin(apart))
-        between = place(wall, 0.5 * (lumen.balls.centres[i] + other.balls.centres[j[i]]))
-        if apart[i] < 2.0 * NEAR * lumen.radius and len(openings) < 2:
+    likely = [
+        other
+        for other in others
+        if other.depth >= lumen.depth
+        and other.length >= COMPARABLE * lumen.length
+        and 0.5 < other.radius / lumen.radius < 2.0
+    ]
+    if not likely:
+        return
+    ways = [cKDTree(other.balls.centres).query(lumen.balls.centres) for other in likely]
+    nearest = int(np.argmin([apart.min() for apart, _ in ways]))
+    apart, j = ways[nearest]
+    i = int(np.argmin(apart))
+    here, there = lumen.balls.centres[i], likely[nearest].balls.centres[j[i]]
+    between = place(wall, 0.5 * (here + there))
+    if apart[i] < 2.0 * NEAR * lumen.radius:
+        if any(_faces(opening, here, there, lumen.radius) for opening in (*openings, *holes)):
+            raise CentrelineError(
+                f"{wall.path}: expected one tube, found parts of it that do not meet near {between}; close the "
+                "gap, or name an entry and an exit in one of them (--entry, --exit)"
+            )
+        if len(openings) < 2:
             raise CentrelineError(
                 f"{wall.path}: expected one free way through the tube, found it blocked or pinched near {between}; "
                 "name an entry and an exit on one side to fly that part"
             )
-        raise CentrelineError(
-            f"{wall.path}: expected one tube, found another of its size beside it, nearest at {between}; name an "
-            "entry and an exit in one of them (--entry, --exit)"
-        )
+    raise CentrelineError(
+        f"{wall.path}: expected one tube, found another of its size beside it, nearest at {between}; name an entry "
+        "and an exit in one of them (--entry, --exit)"
+    )
+
+
+def _faces(opening: Opening, here: Floats, there: Floats, radius: float) -> bool:
+    """Whether an opening near a point (3,) faces another, in a tube of some radius (m)."""
+    way = there - opening.centre
+    near = float(np.linalg.norm(opening.centre - here)) < NEAR * radius
+    return near and float(way @ opening.outward) > FACING * float(np.linalg.norm(way))
 
 
 def choose_ends(
@@ -199,12 +241,13 @@ def _nearest(lumen: Lumen, point: Floats) -> tuple[Floats, float]:
 
 
 def _refuse_loop(wall: Wall, lumen: Lumen, start: int, end: int) -> None:
-    """Refuse a space without openings in which two ways of like length join the ends."""
+    """Refuse a space without openings in which two ways of like length join the ends, or that is wide."""
     way = shortest_way(lumen, start, end)
     third = len(way) // 3
     if third < 1:
         return
     middle = way[third:-third]
+    _refuse_wide(wall, lumen, way)
     aside, _ = cKDTree(lumen.balls.centres[middle]).query(lumen.balls.centres)
     kept = aside > TWIN * lumen.radius
     kept[[start, end]] = True
@@ -214,6 +257,21 @@ def _refuse_loop(wall: Wall, lumen: Lumen, start: int, end: int) -> None:
             f"{wall.path}: expected a tube with two ends, found a closed loop through "
             f"{place(wall, lumen.balls.centres[start])} and {place(wall, lumen.balls.centres[end])}; name an entry "
             "and an exit (--entry, --exit)"
+        )
+
+
+def _refuse_wide(wall: Wall, lumen: Lumen, way: Ints) -> None:
+    """Refuse a space much of which lies far from a way through it, and in sight of it: no wall is gone round."""
+    centres = lumen.balls.centres
+    aside, nearest = cKDTree(centres[way]).query(centres)
+    far = np.flatnonzero(aside > FAR * lumen.radius)
+    if len(far) < WIDE * len(centres):
+        return
+    seen = ~wall.scene.blocked(centres[far], centres[way[nearest[far]]])
+    if seen.mean() > 0.5:
+        at = place(wall, centres[way[len(way) // 2]])
+        raise CentrelineError(
+            f"{wall.path}: expected a tube, found a wide or flat space without openings around {at}"
         )
 
 
