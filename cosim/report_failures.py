@@ -20,11 +20,10 @@ DEADLINE: Final = 600.0
 
 
 def failures_of(results: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Every failed episode and the name of its run's folder, which says which one it is."""
+    """Every failed episode and the name of its run's folder: its number among all episodes, and the pilot."""
     for number, episode in enumerate(results["flown"]):
         if episode["outcome"] != "success":
-            pilot = Path(episode["policy"]).stem
-            yield f"{number:05d}-{pilot}-level{episode['level']}-seed{episode['seed']}", episode
+            yield f"{number:05d}-{Path(episode['policy']).stem}", episode
 
 
 def flown_failures(path: Path, results: Mapping[str, Any]) -> list[Path]:

@@ -74,10 +74,10 @@ function failuresOf(evaluation, runs, onFocus) {
       "tr",
       {},
       make("td", {}, replayOf(failure, runs, onFocus)),
+      make("td", {}, chip(failure.outcome)),
       make("td", {}, failure.policy),
       make("td", { class: "number" }, `${failure.level}`),
       make("td", { class: "number" }, `${failure.seed}`),
-      make("td", {}, chip(failure.outcome)),
       make("td", { class: "number" }, `${failure.steps}`),
       make("td", { class: "number" }, percent(failure.progress)),
       make("td", { class: "number" }, `${fixed(failure.min_clearance_m, 3)} m`),
@@ -115,7 +115,7 @@ function failuresOf(evaluation, runs, onFocus) {
       make("code", {}, `cosim report ${evaluation.folder} --fly ${Math.min(failures.length, SHOWN_FAILURES)}`),
       " does so and links the replays.",
     ),
-    table(["replay", "pilot", ">level", ">seed", "outcome", ">steps", ">progress", ">smallest gap", "flown again by"], body),
+    table(["replay", "outcome", "pilot", ">level", ">seed", ">steps", ">progress", ">smallest gap", "flown again by"], body),
     ...(more ? [more] : []),
   ];
 }
@@ -128,7 +128,7 @@ function commandOf(failure) {
     { type: "button", class: "plain", "aria-label": "Copy the command", onclick: () => copyText(code, copy) },
     "copy",
   );
-  return make("div", { class: "command" }, code, copy);
+  return make("div", { class: "command" }, copy, code);
 }
 
 /** A link to the replay of a failure where its run is on the page. */

@@ -219,6 +219,7 @@ class Report {
     this.stage.choose(focus, visible);
     this.plots.choose(focus, visible);
     byId("ending").replaceChildren(...endingOf(focus, (time) => this.lookAt(time)));
+    for (const whose of document.querySelectorAll(".whose")) whose.textContent = this.many ? ` · ${focus.label}` : "";
     byId("phase-rows").replaceChildren(...phasesOf(focus));
     byId("facts").replaceChildren(...factsOf(focus));
     for (const row of document.querySelectorAll("[data-run]")) {

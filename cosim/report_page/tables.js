@@ -80,7 +80,7 @@ function thinnedNotes(data) {
 
 /** The table of several runs, which is the legend as well: a tick shows a run, its name brings it into focus. */
 function runsTable(runs, onFocus, onVisible) {
-  const head = ["", "run", "pilot", "tube", "outcome", ">steps", ">progress", ">Q", ">smallest gap", ">contact"];
+  const head = ["", "run", "outcome", "pilot", "tube", ">steps", ">progress", ">Q", ">smallest gap", ">contact"];
   const rows = runs.map((run) => {
     const tick = make("input", {
       type: "checkbox",
@@ -106,8 +106,8 @@ function runsTable(runs, onFocus, onVisible) {
           run.label,
         ),
       ),
-      ...[run.policy, run.tube_name].map((text) => make("td", {}, text)),
       make("td", {}, chip(run.outcome)),
+      ...[run.policy, run.tube_name].map((text) => make("td", {}, text)),
       ...[run.steps, percent(run.progress), fixed(run.quality, 3), `${fixed(run.gap, 3)} m`, run.contacts].map((text) =>
         make("td", { class: "number" }, `${text}`),
       ),
