@@ -63,13 +63,20 @@ def evaluate(as_json: bool, **options: Any) -> None:
 @option(
     "--from-step", type=click.IntRange(min=0), required=True, metavar="K", help="The last step of the run."
 )
+@option("--mesh", type=click.Path(path_type=Path), metavar="PATH", help="Where its tube is now.")
 @option("--server", metavar="COMMAND", help="Start your physics as COMMAND RENDEZVOUS.")
 @option(
     "--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [default: a new one in runs/]."
 )
 @json_option
 def replay(
-    run: Path, policy: str, from_step: int, server: str | None, out: Path | None, as_json: bool
+    run: Path,
+    policy: str,
+    from_step: int,
+    mesh: Path | None,
+    server: str | None,
+    out: Path | None,
+    as_json: bool,
 ) -> None:
     """Rebuild the state at step K of a run by sending its commands again, then let another policy fly on.
 
@@ -80,4 +87,4 @@ def replay(
     """
     from cosim.replay import replay as run_replay
 
-    run_replay(run, policy=policy, from_step=from_step, server=server, out=out, as_json=as_json)
+    run_replay(run, policy=policy, from_step=from_step, mesh=mesh, server=server, out=out, as_json=as_json)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -17,6 +17,7 @@ from cosim.recording import (
     POSE_BYTES,
     Column,
     manifest_digest,
+    manifest_text,
     next_link,
 )
 from cosim.runs import Run, chunks, element_names
@@ -40,10 +41,14 @@ class Finding:
         return f"{at}{self.what}: expected {self.expected}, found {self.found}"
 
 
-def check_data(run: Run) -> Iterator[Finding]:
+def check_data(run: Run, done: Callable[[float], None] = lambda _: None) -> Iterator[Finding]:
     """Everything in a run folder that was changed after it was recorded, in the order of the log.
 
     A single flipped bit is located and named; of larger damage the record is named.
+
+    Args:
+        run: as it was read.
+        done: is told how many records more were checked.
     """
     yield from _check_manifest(run)
     chain = b""
@@ -65,6 +70,7 @@ def check_data(run: Run) -> Iterator[Finding]:
             # After damage the chain goes on from what stands, so that one fault is not named at every step.
             chain, damaged = link, not whole
         first += len(stored)
+        done(len(stored))
     yield from _check_end(run, chain)
 
 
@@ -73,6 +79,8 @@ def _check_manifest(run: Run) -> Iterator[Finding]:
     if expected != found:
         stated = f"the SHA-256 that it states ({str(expected)[:16]}…)"
         yield Finding(MANIFEST, stated, f"{found[:16]}…: it was changed")
+    elif (run.folder / MANIFEST).read_text() != manifest_text(run.manifest):
+        yield Finding(MANIFEST, "the text that was recorded", "another of the same values")
 
 
 def _check_end(run: Run, chain: bytes) -> Iterator[Finding]:
@@ -84,10 +92,8 @@ def _check_end(run: Run, chain: bytes) -> Iterator[Finding]:
     if manifest["records"] != count or rest:
         more = f" and {rest} bytes" if rest else ""
         yield Finding(LOG, f"{manifest['records']} records", f"{count}{more}")
-    elif manifest["trajectory_hash"] != chain.hex():
-        yield Finding(
-            "trajectory_hash", f"{manifest['trajectory_hash'][:16]}… of the manifest", f"{chain.hex()[:16]}…"
-        )
+    elif (stated := str(manifest.get("trajectory_hash"))) != chain.hex():
+        yield Finding("trajectory_hash", f"{stated[:16]}… of the manifest", f"{chain.hex()[:16]}…")
 
 
 def _damage(run: Run, index: int, record: bytes, check: int) -> Finding:

@@ -225,6 +225,10 @@ def _fly_recorded(flight: Flight, after: Continuation | None) -> dict[str, Any]:
         status = "interrupted"
         click.echo(f"interrupted after {recorder.records} records, which are saved in {folder}", err=True)
         raise
+    except Exception as error:
+        if recorder.records:
+            error.add_note(f"{recorder.records} records are saved in {folder}")
+        raise
     finally:
         recorder.close(status, report)
     return report

@@ -163,7 +163,7 @@ def _read_checkpoint(name: str, path: Path, base: Settings, terms: Terms) -> Pil
     )
     description = {
         "name": path.stem,
-        "path": str(path),
+        "path": str(path.resolve()),
         "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
         "sees": _sees(contract),
         "training": dict(contract.training),

@@ -15,6 +15,7 @@ import json
 import os
 import time
 import zlib
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +32,9 @@ MANIFEST: Final = "manifest.json"
 LOG: Final = "steps.bin"
 FORMAT: Final = 2
 DIGEST: Final = "manifest_sha256"
+
+SYNC_NS: Final = 1_000_000_000
+"""How often the log is put on the disk itself (ns): the most that a crash of the whole machine takes from a run."""
 
 COMMAND_BYTES: Final = 8 * COMMAND_WORDS
 POSE_BYTES: Final = 8 * POSE_WORDS
@@ -157,8 +161,15 @@ def manifest_digest(manifest: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
+def manifest_text(manifest: dict[str, Any]) -> str:
+    """A manifest as it stands in its file, to the last character."""
+    return json.dumps(manifest, indent=1, allow_nan=False) + "\n"
+
+
 class Recorder:
     """Writes one flight of one lane; every record is with the operating system before the next is made.
+
+    Once a second the log is put on the disk itself, which takes some milliseconds.
 
     Args:
         folder: the run folder, without a run in it.
@@ -183,6 +194,7 @@ class Recorder:
         self._entropy, self._check = self._row["entropy"], self._row["check"]
         self._record, self._episode = words.data, words[_episode_offset() :]
         self._chain = b""
+        self._sync_due = 0
         self.records = 0
         self.manifest = manifest | {
             "format": FORMAT,
@@ -223,11 +235,14 @@ class Recorder:
         try:
             if self._log.write(self._record) != len(self._record):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # a raw file may take half a record
+            self.records += 1
+            if started >= self._sync_due:
+                os.fsync(self._log.fileno())
+                self._sync_due = started + SYNC_NS
         except OSError as error:
             raise OutputError(
                 f"{self.folder / LOG} cannot be written: {error.strerror}; {self.records} records stand"
             ) from error
-        self.records += 1
         self._recording[0] = time.perf_counter_ns() - started
 
     def write_manifest(self) -> None:
@@ -236,16 +251,38 @@ class Recorder:
         partial = path.with_suffix(".partial")
         self.manifest[DIGEST] = manifest_digest(self.manifest)
         try:
-            partial.write_text(json.dumps(self.manifest, indent=1, allow_nan=False) + "\n")
+            with partial.open("w") as file:
+                file.write(manifest_text(self.manifest))
+                file.flush()
+                os.fsync(file.fileno())  # on the disk before it takes the other's name
             partial.replace(path)
+            if os.name == "posix":
+                _sync_folder(self.folder)
         except OSError as error:
-            raise OutputError(f"{path} cannot be written: {error.strerror}") from error
+            with suppress(OSError):  # what matters is why it could not be written
+                partial.unlink(missing_ok=True)
+            raise OutputError(
+                f"{path} cannot be written: {error.strerror}; {self.records} records stand in {LOG}"
+            ) from error
 
     def close(self, status: str, outcome: dict[str, Any]) -> None:
-        """Close, and say in the manifest how the run ended."""
+        """Close, and say in the manifest how the run ended.
+
+        Raises:
+            OutputError: the manifest cannot be written, and goes on saying that the run is running.
+        """
         self._log.close()
         self.manifest["status"] = status
         self.manifest["records"] = self.records
         self.manifest["trajectory_hash"] = self.trajectory_hash
         self.manifest["outcome"] = outcome
         self.write_manifest()
+
+
+def _sync_folder(folder: Path) -> None:
+    """Put the names of the files in a folder on the disk."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -24,7 +24,14 @@ from protocol.plant import TubeReference
 
 
 def replay(
-    folder: Path, *, policy: str, from_step: int, server: str | None, out: Path | None, as_json: bool
+    folder: Path,
+    *,
+    policy: str,
+    from_step: int,
+    mesh: Path | None,
+    server: str | None,
+    out: Path | None,
+    as_json: bool,
 ) -> None:
     """Fly a run again up to a step, let another policy fly on, and compare the two from there.
 
@@ -32,6 +39,7 @@ def replay(
         folder: of the run.
         policy: who flies on, as for `cosim launch --policy`.
         from_step: last control step of the run that is flown again.
+        mesh: where its tube is now, None for where it was.
         server: command of the physics process, None for the run's own.
         out: folder of the new run, None for a new one.
         as_json: one JSON object on stdout and nothing else.
@@ -41,18 +49,21 @@ def replay(
         CosimError, MeshError, AgentError, ProtocolError: as `launch`.
     """
     run = read_run(folder)
-    last = len(run.records) - 1
-    if not from_step < last:
+    last = _last_step(run)
+    if not from_step <= last:
         raise RunError(
-            f"{folder}: --from-step: expected 0 to {last - 1}, found {from_step}: it has {last} steps"
+            f"{folder}: --from-step: expected 0 to {last}, found {from_step}: it has {len(run.records) - 1} steps"
         )
     for finding in check_data(run):
         if finding.step is None or finding.step <= from_step:
             raise RunError(f"{folder} is not as it was recorded: {finding}")
-    tube, changed = find_tube(run, None)
+    tube, changed = find_tube(run, mesh)
     if tube is None or changed:
         raise RunError(f"{folder}: {changed[0]}")
-    options = replace(options_of(run), policy=policy, lookahead=None, speed=None, out=out)
+    dt = run.manifest["session"]["dt"]  # the policy that flew may have brought its own
+    options = replace(
+        options_of(run), policy=policy, lookahead=None, speed=None, dt=dt, realtime=None, out=out
+    )
     if options.tube is None:
         options = _same_tube(options, run, tube)
     if options.connect is not None and server is None:
@@ -66,9 +77,23 @@ def replay(
         click.echo(comparison(run, read_run(Path(report["run_dir"])), from_step))
 
 
+def _last_step(run: Run) -> int:
+    """The last step from which a flight can go on: of a flight that came to its end the last but one.
+
+    Raises:
+        RunError: there is no whole record.
+    """
+    if not len(run.records):
+        raise RunError(f"{run.folder}: expected a run with at least its reset pose, found no whole record")
+    over = int(run.records["outcome"][-1]) != Outcome.RUNNING
+    return len(run.records) - 1 - over
+
+
 def _same_tube(options: FlightOptions, run: Run, tube: TubeReference) -> FlightOptions:
     """Options that name the tube as it was resolved, along the centreline that was flown: nothing is found anew."""
     centreline = where_is(run, run.manifest["mesh"]["centreline"])
+    if not centreline.is_file():  # it is the recorded one: `find_tube` compared it
+        centreline = Path(tube.path).with_name(centreline.name)
     return replace(
         options,
         mesh=tube.path,
@@ -124,19 +149,20 @@ def comparison(first: Run, second: Run, from_step: int) -> str:
 
 
 def _after(run: Run, from_step: int) -> dict[str, str]:
-    records = run.records[from_step + 1 :]
+    records, reached = run.records[from_step + 1 :], run.records[-1]
     body_radius = run.manifest["parameters"]["body_radius"]
     inside = records["clearance"][records["inside"].astype(bool)]
+    speeds = np.linalg.norm(records["linear_velocity"], axis=1)
     return {
         "policy": str(run.manifest["policy"]["name"])[:20],
-        "outcome": Outcome(int(records["outcome"][-1])).name.lower(),
+        "outcome": "cut short"
+        if reached["outcome"] == Outcome.RUNNING
+        else Outcome(int(reached["outcome"])).name.lower(),
         "control steps": str(len(records)),
-        "progress": f"{100.0 * float(records['progress'][-1]):.1f} %",
-        "smallest gap to the wall": f"{float(inside.min()) - body_radius:.3f} m"
-        if len(inside)
-        else "outside",
-        "mean speed": f"{float(np.linalg.norm(records['linear_velocity'], axis=1).mean()):.2f} m/s",
-        "mean alignment": f"{float(records['alignment'].mean()):.3f}",
+        "progress": f"{100.0 * float(reached['progress']):.1f} %",
+        "smallest gap to the wall": f"{float(inside.min()) - body_radius:.3f} m" if len(inside) else "-",
+        "mean speed": f"{float(speeds.mean()):.2f} m/s" if len(records) else "-",
+        "mean alignment": f"{float(records['alignment'].mean()):.3f}" if len(records) else "-",
         "reward": f"{float(records['reward'].sum()):.1f}",
     }
 

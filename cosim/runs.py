@@ -12,7 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import RunError
-from cosim.recording import COMMAND_BYTES, FORMAT, MANIFEST, POSE_BYTES, Column, record_dtype
+from cosim.recording import (
+    ADDED,
+    COMMAND_BYTES,
+    EPISODE,
+    FORMAT,
+    MANIFEST,
+    PAYLOAD,
+    POSE_BYTES,
+    Column,
+    record_dtype,
+)
 from protocol.plant import COMMAND_WORDS
 
 CHUNK: Final = 8192
@@ -32,15 +42,27 @@ class Run:
     """One record a control step, the reset pose first; the fields are `columns`."""
 
 
+class _Described(dict[str, Any]):
+    """An object in a manifest, which says whose it is where something is missing."""
+
+    def __init__(self, path: Path, values: dict[str, Any]) -> None:
+        super().__init__(values)
+        self._path = path
+
+    def __missing__(self, key: str) -> Any:
+        raise RunError(f"{self._path}: expected {key!r}, found none: it is damaged, or of another version")
+
+
 def read_run(folder: Path) -> Run:
     """Read a run folder; a log that was cut short ends with its last whole record.
 
     Raises:
-        RunError: no folder, no manifest, a manifest of another format, or a log that does not fit it.
+        RunError: no folder, no manifest, a manifest of another format, or a log that does not fit it. What is
+            missing in the manifest raises it where it is asked for.
     """
     path = folder / MANIFEST
     try:
-        manifest = json.loads(path.read_text())
+        manifest = json.loads(path.read_text(), object_hook=lambda values: _Described(path, values))
     except OSError as error:
         raise RunError(f"{path}: expected the manifest of a run, found none ({error.strerror})") from error
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
@@ -55,8 +77,10 @@ def read_run(folder: Path) -> Run:
         )
         log = folder / manifest["log"]
         dtype = record_dtype(columns, manifest["record_bytes"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, SyntaxError) as error:  # the last of a damaged numpy type
         raise RunError(f"{path}: the description of a record is damaged ({error})") from error
+    if missing := {*(name for name, *_ in (*PAYLOAD, *ADDED)), *EPISODE} - set(dtype.names or ()):
+        raise RunError(f"{path}: record: expected a field {min(missing)!r}, found none")
     try:
         count = log.stat().st_size // dtype.itemsize
         records = np.memmap(log, dtype, mode="r", shape=(count,)) if count else np.zeros(0, dtype)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import csv
+import errno
 import hashlib
 import json
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
-from flights import Done
+from flights import Done, run_here
 
 from cosim.errors import OutputError, RunError
 from cosim.export import export
@@ -88,6 +90,27 @@ def test_a_log_cut_short_ends_with_its_last_whole_record(run: Run, tmp_path: Pat
     size = run.records.dtype.itemsize
     (tmp_path / "steps.bin").write_bytes((run.folder / "steps.bin").read_bytes()[: 7 * size + size // 2])
     assert len(read_run(tmp_path).records) == 7
+
+
+def test_a_full_disk_ends_a_flight_that_is_saved_so_far(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The log is put on the disk itself once a second; where that fails the flight ends, and what stands is read."""
+    fsync, calls = os.fsync, []
+
+    def full(handle: int) -> None:
+        calls.append(handle)
+        if len(calls) == 4:  # the manifest, its folder, the reset pose; then the log a second later
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(handle)
+
+    monkeypatch.setattr("os.fsync", full)
+    monkeypatch.setattr("cosim.recording.SYNC_NS", 0)
+    done = run_here("launch", "--max-steps", "5", "--out", str(tmp_path / "run"))
+    assert done.status == 2
+    assert "steps.bin cannot be written: No space left on device; 2 records stand" in done.stderr
+    run = read_run(tmp_path / "run")
+    assert (run.manifest["status"], len(run.records)) == ("failed", 2)
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:

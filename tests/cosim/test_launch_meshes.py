@@ -169,7 +169,9 @@ def test_a_found_centreline_makes_a_whole_run(fly: Callable[..., Done], tmp_path
     )
     assert flown_on.status == 0, flown_on.stderr
     assert flown_on.report["trajectory_hash"] == done.report["trajectory_hash"]
+    assert manifest_of(again)["mesh"]["centreline"] == str(again / stored.name)  # it needs no other run
     moved = (tmp_path / "run").rename(tmp_path / "elsewhere")
+    assert find_tube(read_run(again), None)[1] == []
     verified = run_cosim("verify", str(moved), "--json", cwd=tmp_path)
     assert (verified.status, verified.report["verified"]) == (0, True), verified.stdout
 

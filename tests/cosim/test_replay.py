@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from flights import Done, run_cosim, run_here
 
+from cosim.recording import manifest_digest, manifest_text
 from cosim.runs import read_run
 
 SHARED = 60
@@ -63,6 +65,26 @@ def test_another_policy_parts_exactly_after_the_step(hard_run: Path, replay: Cal
     continues = read_run(folder).manifest["continues"]
     assert continues["from_step"] == SHARED
     assert continues["trajectory_hash"] == before["chain"][SHARED].tobytes().hex()
+
+
+def test_a_run_that_was_cut_short_goes_on_from_its_last_step(hard_run: Path, tmp_path: Path) -> None:
+    """What a crash left behind is flown on, by the same policy to the end that the flight would have had."""
+    cut = tmp_path / "cut"
+    shutil.copytree(hard_run, cut)
+    size = read_run(cut).records.dtype.itemsize
+    with (cut / "steps.bin").open("r+b") as log:
+        log.truncate((SHARED + 1) * size + size // 2)
+    manifest = json.loads((cut / "manifest.json").read_text()) | {"status": "running"}
+    whole = manifest.pop("trajectory_hash")
+    for key in ("records", "outcome"):
+        del manifest[key]
+    manifest["manifest_sha256"] = manifest_digest(manifest)
+    (cut / "manifest.json").write_text(manifest_text(manifest))
+    arguments = ("--policy", "tube_ppo", "--from-step", str(SHARED), "--out", str(tmp_path / "on"))
+    done = run_cosim("replay", str(cut), *arguments, cwd=tmp_path)
+    assert done.status == 0, done.stderr
+    assert json.loads((tmp_path / "on" / "manifest.json").read_text())["trajectory_hash"] == whole
+    assert "cut short" in done.stdout
 
 
 def test_a_step_that_the_run_does_not_have_is_refused(hard_run: Path) -> None:

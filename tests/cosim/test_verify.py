@@ -10,10 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flights import Done, run_cosim, run_here
+from flights import Done, manifest_of, run_cosim, run_here
 
+from cosim.errors import RunError
 from cosim.integrity import Finding, check_data
-from cosim.recording import manifest_digest
+from cosim.pilots import SHIPPED_CHECKPOINT, choose_pilot, read_pilot
+from cosim.recording import manifest_digest, manifest_text
 from cosim.runs import read_run
 
 
@@ -39,7 +41,7 @@ def rewrite(folder: Path, change: Callable[[dict], None], renew: bool = False) -
     change(manifest)
     if renew:
         manifest["manifest_sha256"] = manifest_digest(manifest)
-    path.write_text(json.dumps(manifest))
+    path.write_text(manifest_text(manifest))
 
 
 def test_a_run_verifies_and_says_how_long_physics_took(conduit_run: tuple[Done, Path]) -> None:
@@ -98,6 +100,69 @@ def test_a_changed_manifest_is_found(copied: Path) -> None:
     assert finding.what == "manifest.json"
 
 
+def test_a_bit_of_the_manifest_that_changes_no_value_is_found(copied: Path) -> None:
+    """An exponent of another case, a digit beyond a number's precision: the text is not what was recorded."""
+    path = copied / "manifest.json"
+    path.write_text(path.read_text().replace("e-", "E-", 1))
+    (finding,) = check_data(read_run(copied))
+    assert (finding.what, finding.found) == ("manifest.json", "another of the same values")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda manifest: manifest.pop("mesh"),
+        lambda manifest: manifest["options"].pop("transport"),
+        lambda manifest: manifest["mesh"].update(axes="zuq"),
+        lambda manifest: manifest.update(versions="1"),
+        lambda manifest: manifest["reset"].update(seed="?"),
+    ],
+    ids=["no mesh", "no transport", "unknown axes", "no versions", "no seed"],
+)
+def test_a_manifest_that_makes_no_sense_any_more_is_named(
+    copied: Path, change: Callable[[dict], None]
+) -> None:
+    """Whatever is missing or of another kind, the manifest is what was changed, and no fault of cosim itself."""
+    rewrite(copied, change)
+    done = run_here("verify", str(copied), "--json")
+    assert done.status == 1, done.stderr
+    assert [finding["what"] for finding in done.report["damage"]] == ["manifest.json"]
+    assert "the manifest, which was changed" in done.report["not_replayed"]
+
+
+def test_a_damaged_description_of_a_record_is_refused(copied: Path) -> None:
+    """A field of another name, and a type that numpy does not know, name the manifest."""
+    for change in ({"name": "chaio"}, {"type": "<f8,"}):
+        rewrite(copied, lambda manifest, change=change: manifest["record"][11].update(change))
+        with pytest.raises(RunError, match=r"manifest\.json: .*record"):
+            read_run(copied)
+
+
+def test_a_policy_is_recorded_where_it_is_from_any_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A checkpoint that was named relative to the working folder is found from another one."""
+    (tmp_path / "mine.zip").write_bytes(SHIPPED_CHECKPOINT.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    assert read_pilot(choose_pilot("mine.zip")).description["path"] == str(tmp_path / "mine.zip")
+
+
+def test_files_that_were_moved_are_named_with_what_to_say(copied: Path, tmp_path: Path) -> None:
+    """A mesh that is gone is named with the option that says where it is; with it, and the policy's, all is found."""
+    described = manifest_of(copied)
+
+    def change(manifest: dict) -> None:
+        manifest["mesh"]["path"] = manifest["policy"]["path"] = str(tmp_path / "gone")
+
+    rewrite(copied, change, renew=True)
+    gone = run_here("verify", str(copied))
+    assert gone.status == 1
+    assert "if it was moved, say where it is: --mesh" in gone.stdout
+    places = ("--mesh", described["mesh"]["path"], "--policy", described["policy"]["path"])
+    found = run_here("verify", str(copied), *places)
+    assert found.status == 0, found.stdout
+
+
 def test_a_changed_command_is_named_where_physics_first_differs(copied: Path) -> None:
     """Of a flipped bit of a command, the record is named, and the step at which poses part."""
     offset = next(c.offset for c in read_run(copied).columns if c.name == "commanded_speed")
@@ -139,12 +204,14 @@ def test_a_changed_policy_and_version_are_named(copied: Path, tmp_path: Path) ->
     def change(manifest: dict) -> None:
         manifest["policy"]["path"] = str(other)
         manifest["versions"]["numpy"] = "1.0"
+        manifest["plant"]["engine"] = "bullet 2.0"
 
     rewrite(copied, change, renew=True)
     done = run_cosim("verify", str(copied), cwd=copied)
     assert done.status == 1
     assert f"policy {other}: expected SHA-256" in done.stdout
     assert "note: version of numpy: expected 1.0" in done.stdout
+    assert "note: engine of physics: expected bullet 2.0" in done.stdout
     assert "bit for bit" in done.stdout
 
 
