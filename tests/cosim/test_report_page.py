@@ -50,6 +50,14 @@ def opened(browser: Browser, page: Path) -> Browser:
     return browser
 
 
+@pytest.fixture
+def drawn(browser: Browser, page: Path) -> Browser:
+    """The browser with the page of one run, in whatever state others left it."""
+    if browser.driver.current_url != page.resolve().as_uri():
+        browser.open(page)
+    return browser
+
+
 def places(browser: Browser) -> np.ndarray[Any, Any]:
     """Where the drones stand in the view, (R, 3) in metres."""
     return np.array(browser.run("return report.state().positions"))
@@ -140,9 +148,10 @@ def test_the_camera_follows_the_drone_and_looks_out_of_it(opened: Browser, run: 
     assert_at(run, 250, np.array(opened.run("return report.view.camera.position.toArray()")))
 
 
-def test_the_view_does_not_hold_a_reader_who_scrolls_by(opened: Browser) -> None:
+def test_the_view_does_not_hold_a_reader_who_scrolls_by(drawn: Browser) -> None:
     """The wheel is the page's until the view is clicked and again once the mouse is gone; a finger scrolls too."""
     taken = (
+        "report.view.setCamera('overview');"
         "const canvas = document.getElementById('canvas');"
         "const send = (kind) => canvas.dispatchEvent("
         "  new PointerEvent(kind, { pointerId: 1, pointerType: 'mouse', isPrimary: true, bubbles: true }));"
@@ -153,7 +162,7 @@ def test_the_view_does_not_hold_a_reader_who_scrolls_by(opened: Browser) -> None
         "send('pointerleave'); found.push(wheel());"
         "return [found, getComputedStyle(canvas).touchAction]"
     )
-    assert opened.run(taken) == [[False, True, False], "pan-y"]
+    assert drawn.run(taken) == [[False, True, False], "pan-y"]
 
 
 def test_scans_end_on_the_wall(opened: Browser, run: Run) -> None:
@@ -199,6 +208,65 @@ def test_every_chart_has_its_curves_and_the_cursor_goes_along(opened: Browser, r
     )
     clearance = run.records["clearance"][77]
     assert hovered == [f"{clearance:.3f}", "7.7 s", round(middle * len(run.records)), ""]
+
+
+def test_strips_show_what_was_recorded_however_many_records_a_pixel_has(drawn: Browser) -> None:
+    """One bad record among thousands colours its own pixel and no more; one lost sight leaves a gap as wide."""
+    found = drawn.run(
+        "const count = 20000, chart = report.plots.charts.find((one) => one.definition.strip);"
+        "const run = report.runs[0], old = { ...run.series }, counted = run.count;"
+        "run.count = count;"
+        "run.series.time = Float32Array.from({ length: count }, (_, i) => 0.1 * i);"
+        "for (const name of ['regime', 'target_visible', 'memory_available', 'contact'])"
+        "  run.series[name] = new Uint8Array(count).fill(name === 'contact' ? 0 : 1);"
+        "run.series.regime[1005] = 2; run.series.target_visible[15000] = 0;"
+        "chart.draw();"
+        "const widths = (kind) => [...chart.svg.querySelectorAll(kind)].map((band) => +band.getAttribute('width'));"
+        "const found = [widths('.regime.v2'), widths('.target_visible')];"
+        "run.count = counted; Object.assign(run.series, old); chart.draw();"
+        "return found"
+    )
+    (memory,), seen = found
+    assert memory < 3.0
+    assert len(seen) == 2
+
+
+def test_the_headline_is_what_the_flight_reported(
+    drawn: Browser, conduit_run: tuple[Done, Path], run: Run
+) -> None:
+    """Figures at the top are those of `cosim launch --json`, rounded; the smallest gap leads to its own record."""
+    told = conduit_run[0].report
+    figures = dict(
+        drawn.run(
+            "return [...document.querySelectorAll('.figures > div')]"
+            ".map((one) => [...one.children].map((e) => e.innerText))"
+        )
+    )
+    assert figures == {
+        "progress": f"{100 * told['progress']:.1f} %",
+        "quality Q": f"{told['quality']:.3f}",
+        "smallest gap": f"{told['min_clearance_m']:.3f} m",
+        "steps with contact": str(told["contacts"]),
+        "loop": f"{round(told['steps_per_second']):,} /s",
+        "seed": str(run.manifest["options"]["seed"]),
+    }
+    drawn.driver.find_element("css selector", ".figures button").click()
+    assert drawn.run("return report.state().record") == int(run.records["clearance"].argmin())
+
+
+def test_what_is_sensed_is_drawn_without_the_view(drawn: Browser, run: Run) -> None:
+    """The section seen from behind has the scan's corners at the recorded distances, and the decision of the step."""
+    drawn.run("report.player.seekRecord(30)")
+    scale = drawn.run("return report.dial.scale")
+    ring = drawn.run("return report.dial.marks.front.getAttribute('d')")
+    corners = np.array([[float(x) for x in pair.split()] for pair in ring.strip("MZ").split("L")])
+    rays = len(corners)
+    np.testing.assert_allclose(
+        np.linalg.norm(corners, axis=1) / scale, run.records["lidar"][30][:rays], atol=0.01
+    )
+    right, above = corners[0], corners[rays // 4]
+    assert right[0] > 0.0 > above[1]
+    assert drawn.run("return report.dial.marks.decided.getAttribute('visibility')") == "visible"
 
 
 def test_curves_are_drawn_by_arc_length_and_over_a_span_too(opened: Browser) -> None:
@@ -295,44 +363,6 @@ def test_a_flight_that_met_a_wall_opens_at_that_moment(browser: Browser, run: Ru
     assert browser.complaints() == []
 
 
-def test_the_headline_is_what_the_flight_reported(
-    opened: Browser, conduit_run: tuple[Done, Path], run: Run
-) -> None:
-    """Figures at the top are those of `cosim launch --json`, rounded; the smallest gap leads to its own record."""
-    told = conduit_run[0].report
-    figures = dict(
-        opened.run(
-            "return [...document.querySelectorAll('.figures > div')]"
-            ".map((one) => [...one.children].map((e) => e.innerText))"
-        )
-    )
-    assert figures == {
-        "progress": f"{100 * told['progress']:.1f} %",
-        "quality Q": f"{told['quality']:.3f}",
-        "smallest gap": f"{told['min_clearance_m']:.3f} m",
-        "steps with contact": str(told["contacts"]),
-        "loop": f"{round(told['steps_per_second']):,} /s",
-        "seed": str(run.manifest["options"]["seed"]),
-    }
-    opened.driver.find_element("css selector", ".figures button").click()
-    assert opened.run("return report.state().record") == int(run.records["clearance"].argmin())
-
-
-def test_what_is_sensed_is_drawn_without_the_view(opened: Browser, run: Run) -> None:
-    """The section seen from behind has the scan's corners at the recorded distances, and the decision of the step."""
-    opened.run("report.player.seekRecord(30)")
-    scale = opened.run("return report.dial.scale")
-    ring = opened.run("return report.dial.marks.front.getAttribute('d')")
-    corners = np.array([[float(x) for x in pair.split()] for pair in ring.strip("MZ").split("L")])
-    rays = len(corners)
-    np.testing.assert_allclose(
-        np.linalg.norm(corners, axis=1) / scale, run.records["lidar"][30][:rays], atol=0.01
-    )
-    right, above = corners[0], corners[rays // 4]
-    assert right[0] > 0.0 > above[1]
-    assert opened.run("return report.dial.marks.decided.getAttribute('visibility')") == "visible"
-
-
 @pytest.mark.parametrize("which", ["page", "overlay"])
 def test_it_fits_a_phone(browser: Browser, which: str, request: pytest.FixtureRequest) -> None:
     """In a window of 390 pixels nothing is wider than the window, and slider and play can be reached."""
@@ -391,24 +421,3 @@ def test_it_does_without_webgl(browser: Browser, page: Path, tmp_path: Path) -> 
     assert browser.run("return document.querySelectorAll('path.curve').length") > 10
     assert abs(browser.run("return +document.querySelector('.plan circle').getAttribute('cx')") - before) > 50
     assert browser.complaints() == []
-
-
-def test_strips_show_what_was_recorded_however_many_records_a_pixel_has(opened: Browser) -> None:
-    """One bad record among thousands colours its own pixel and no more; one lost sight leaves a gap as wide."""
-    found = opened.run(
-        "const count = 20000, chart = report.plots.charts.find((one) => one.definition.strip);"
-        "const run = report.runs[0], old = { ...run.series }, counted = run.count;"
-        "run.count = count;"
-        "run.series.time = Float32Array.from({ length: count }, (_, i) => 0.1 * i);"
-        "for (const name of ['regime', 'target_visible', 'memory_available', 'contact'])"
-        "  run.series[name] = new Uint8Array(count).fill(name === 'contact' ? 0 : 1);"
-        "run.series.regime[1005] = 2; run.series.target_visible[15000] = 0;"
-        "chart.draw();"
-        "const widths = (kind) => [...chart.svg.querySelectorAll(kind)].map((band) => +band.getAttribute('width'));"
-        "const found = [widths('.regime.v2'), widths('.target_visible')];"
-        "run.count = counted; Object.assign(run.series, old); chart.draw();"
-        "return found"
-    )
-    (memory,), seen = found
-    assert memory < 3.0
-    assert len(seen) == 2
