@@ -93,7 +93,11 @@ def report(sources: Sequence[Path], out: Path | None = None, fly: int = 0) -> Pa
     for path, found in results.items():
         fly_failures(path, found, fly)
     again = [folder for path, found in results.items() for folder in flown_failures(path, found)]
-    given = [source for source in sources if _results_in(source) is None]
+    given = [
+        source.parent if source.name == MANIFEST else source
+        for source in sources
+        if _results_in(source) is None
+    ]
     runs = [read_run(folder) for folder in dict.fromkeys((*given, *again))]
     for run in runs:
         if not len(run.records):

@@ -48,7 +48,8 @@ def describe_ending(run: Run, scene: Scene, curvature: Floats) -> dict[str, Any]
     facts = {"where": _place(run, at, float(curvature[at]))}
     nearest = None
     if len(touched) or ended is Outcome.COLLISION:
-        nearest = nearest_on_wall(scene.tube, now["position"])
+        # A tube that was rebuilt from the log is too coarse, and ends where the flight did.
+        nearest = nearest_on_wall(scene.tube, now["position"]) if not scene.note else _beyond_axis(now)
         facts |= {
             "the wall": _wall(run, now, nearest),
             "the gap": _gap(run, at),
@@ -88,6 +89,13 @@ def nearest_on_wall(wall: Surface, point: Floats) -> Floats:
     slope = distances(point + probe) - distances(point - probe)
     steepest = float(np.linalg.norm(slope))
     return point - away * slope / steepest if steepest > 0.0 else np.array(point)
+
+
+def _beyond_axis(record: np.void) -> Floats:
+    """Straight away from the axis, as far off as the recorded clearance (3,), in metres: the wall of a round tube."""
+    away = record["position"] - record["axis_position"]
+    place: Floats = record["position"] + record["clearance"] * away / max(float(np.linalg.norm(away)), 1e-12)
+    return place
 
 
 def sides(direction: Floats) -> str:

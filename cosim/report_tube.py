@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cosim.errors import CosimError
 from cosim.report_run import AddArray
+from cosim.requirements import install_command
 from cosim.scene import Scene, Surface
 
 Floats = NDArray[np.float64]
@@ -56,7 +57,7 @@ def simplify(surface: Surface, triangles: int) -> Surface:
         import fast_simplification  # quadric error metrics
     except ImportError as error:
         raise CosimError(
-            "large meshes need fast-simplification; install it with: pip install fast-simplification"
+            f"large meshes need fast-simplification; install it with: {install_command('view')}"
         ) from error
     vertices, faces = fast_simplification.simplify(
         surface.vertices.astype(np.float32), surface.faces.astype(np.int32), target_count=triangles

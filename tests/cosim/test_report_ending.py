@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,9 @@ def test_the_first_contact_is_the_moment(conduit_run: tuple[Done, Path], tmp_pat
     assert np.linalg.norm(away) == pytest.approx(record["clearance"], rel=0.02)
     assert ending["facts"]["where"].startswith(f"{record['arc_length']:.2f} m along the axis of 75.0 m")
     assert "in a bend of radius 2.00 m" in ending["facts"]["where"]
+    told_by_axis = describe_ending(run, replace(read_scene(run), note="gone"), np.full(60, 0.5))
+    assert told_by_axis is not None
+    np.testing.assert_allclose(told_by_axis["wall"], ending["wall"], atol=0.06, err_msg="without the mesh")
     towards = np.array(ending["wall"]) - before["position"]
     speed = before["linear_velocity"] @ towards / np.linalg.norm(towards)
     assert f"{speed:.2f} m/s of it towards" in ending["facts"]["flown"]
