@@ -145,7 +145,7 @@ def load_policy(path: str | Path) -> Policy:
         except ImportError as error:
             raise PolicyError(
                 f"{path} carries no actor.npz, so that reading it needs torch and stable-baselines3, and "
-                f"{error.name} is missing: install the extra 'train' (pip install 'tube-cosim[train]')"
+                f"{error.name} is missing: install the extra 'train' of tube-cosim, as `cosim doctor` says"
             ) from error
         return load_plain(path)
     return Policy(checkpoint.contract, checkpoint.layers, path)

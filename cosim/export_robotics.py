@@ -20,6 +20,7 @@ from agent_client.reward import Regime
 from agent_client.task import Outcome
 from cosim import __version__
 from cosim.errors import CosimError
+from cosim.requirements import install_command
 from cosim.runs import Run, chunks
 from cosim.scene import read_axis
 
@@ -86,7 +87,7 @@ def write_mcap(run: Run, target: Path, done: Done) -> str:
         )
     except ImportError as error:
         raise CosimError(
-            "MCAP needs the package mcap; install it with: pip install 'tube-cosim[export]'"
+            f"MCAP needs the package mcap; install it with: {install_command('export')}"
         ) from error
     lidar = run.manifest["settings"]["lidar"]
     fields = [c.name for c in run.columns if c.name not in ("chain", "observation", "phases")]

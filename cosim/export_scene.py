@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from cosim import __version__
 from cosim.errors import CosimError, OutputError
+from cosim.requirements import install_command
 from cosim.runs import Run, chunks
 from cosim.scene import Surface, drone_surface, read_surroundings
 
@@ -235,19 +236,22 @@ def write_usd(run: Run, target: Path, done: Done) -> str:
 
     Raises:
         CosimError: usd-core is not installed.
-        OutputError: the file's name does not say which kind of USD is meant, or it cannot be written.
+        OutputError: the file's name does not say which kind of USD is meant.
+        OSError: it cannot be written.
     """
     if target.suffix not in USD_SUFFIXES:
-        raise OutputError(f"{target.name}: expected a name that ends in {' or '.join(USD_SUFFIXES)}")
+        raise OutputError(
+            f"--out: expected a name that ends in {' or '.join(USD_SUFFIXES)}, found {target.suffix!r}"
+        )
     try:
         from pxr import Tf, Usd, UsdGeom  # Pixar's own library: no other writes the binary format
     except ImportError as error:
-        raise CosimError("USD needs usd-core; install it with: pip install 'tube-cosim[export]'") from error
+        raise CosimError(f"USD needs usd-core; install it with: {install_command('export')}") from error
     tube, axis, note = read_surroundings(run)
     count = len(run.records)
     stride = -(-count // MOST_POSES)
     if stride > 1:
-        note += f"{'; ' if note else ''}every {stride}th of {count} poses (glTF and the tables hold all)"
+        note += f"{'; ' if note else ''}one in {stride} of {count} poses (glTF and the tables hold all)"
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -265,8 +269,8 @@ def write_usd(run: Run, target: Path, done: Done) -> str:
     try:
         stage.GetRootLayer().Export(str(target))
     except Tf.ErrorException as error:
-        why = str(error).rsplit(" : ", 1)[-1].strip().strip("'")
-        raise OutputError(f"{target.name} cannot be written: {why}") from error
+        first = str(error).strip().splitlines()[0]  # what follows comes of it
+        raise OSError(first.split(" : '", 1)[-1].removesuffix("'")) from error
     return note
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cosim.errors import CosimError
 from cosim.recording import Column
+from cosim.requirements import install_command
 from cosim.runs import Run, chunks, element_names
 
 Done = Callable[[float], None]
@@ -66,9 +67,7 @@ def write_parquet(run: Run, target: Path, done: Done) -> str:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError as error:
-        raise CosimError(
-            "Parquet needs pyarrow; install it with: pip install 'tube-cosim[export]'"
-        ) from error
+        raise CosimError(f"Parquet needs pyarrow; install it with: {install_command('export')}") from error
     described = {name: {"unit": c.unit, "frame": c.frame} for c in run.columns for name in element_names(c)}
     schema = pa.schema(
         [

@@ -11,6 +11,7 @@ import numpy as np
 from agent_client.curriculum import THRESHOLDS
 from agent_client.training_log import Progress, read_log
 from cosim.errors import CosimError, OutputError
+from cosim.requirements import install_command
 
 SUCCESS: Final = "success.png"
 RETURN: Final = "return.png"
@@ -37,9 +38,7 @@ def draw_figures(log: Path, folder: Path) -> tuple[Path, Path]:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise CosimError(
-            f"figures need {error.name}; install the extra with: pip install 'tube-cosim[train]'"
-        ) from error
+        raise CosimError(f"figures need {error.name}; install it with: {install_command('train')}") from error
     rows = read_log(log)
     if not rows:
         raise CosimError(f"{log}: expected at least one iteration to draw, found none")

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import OutputError, ViewError
+from cosim.requirements import install_command
 
 Image = NDArray[np.uint8]
 """(height, width, 3), the top row first."""
 
 FILMS: Final = (".mp4", ".gif")
 PICTURES: Final = (".png", ".jpg", ".jpeg")
-INSTALL: Final = "install the extra with: pip install 'tube-cosim[view]'"
 
 _QUALITY: Final = {"crf": "20", "preset": "veryfast"}
 
@@ -40,7 +40,9 @@ def check_outputs(picture: Path | None, film: Path | None) -> None:
         try:
             import av  # noqa: F401
         except ImportError as error:
-            raise ViewError(f"{film}: an .mp4 needs PyAV; {INSTALL}, or write a .gif") from error
+            raise ViewError(
+                f"{film}: an .mp4 needs PyAV; install it with: {install_command('view')}, or write a .gif"
+            ) from error
 
 
 def write_picture(path: Path, image: Image, *, quickly: bool = False) -> None:

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from cosim.errors import CosimError, OutputError
+from cosim.requirements import install_command
 from meshes.inspection import Profile
 from meshes.openings import Opening
 from meshes.wall import Wall
@@ -127,7 +128,7 @@ def _figure(width: float, height: float) -> Any:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise CosimError(
-            f"pictures need {error.name}; install the extra with: pip install 'tube-cosim[view]', or leave --out away"
+            f"pictures need {error.name}; install it with: {install_command('view')}, or leave --out away"
         ) from error
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)

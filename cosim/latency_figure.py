@@ -66,7 +66,5 @@ def _matplotlib() -> tuple[Any, Any]:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise CosimError(
-            f"--png needs {error.name}; install the extra with: {install_command('bench')}"
-        ) from error
+        raise CosimError(f"--png needs {error.name}; install it with: {install_command('bench')}") from error
     return FigureCanvasAgg, Figure

@@ -15,6 +15,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.shell_completion import CompletionItem
 
 from cosim.screens import Command, shows_all
 
@@ -202,6 +203,14 @@ class SettingsCommand(Command):
         )  # fmt: skip
         *declared, more, help_option = super().get_params(ctx)
         return [*declared, hard, listing, *settings_options(), more, help_option]
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """The settings too, which click leaves out as hidden."""
+        found = super().shell_complete(ctx, incomplete)
+        if incomplete.startswith("--"):
+            names = (setting.opts[0] for setting in settings_options())
+            found += [CompletionItem(name) for name in names if name.startswith(incomplete)]
+        return found
 
     def leaves_out(self, declared: list[click.Parameter]) -> bool:
         """The named settings are listed by --help-all alone."""

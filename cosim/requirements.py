@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shutil
+import sys
 import tomllib
 from dataclasses import dataclass
 from importlib import metadata
@@ -61,14 +63,24 @@ def is_checkout() -> bool:
     return _PROJECT.is_file() and f'name = "{DISTRIBUTION}"' in _PROJECT.read_text(encoding="utf-8")
 
 
-def install_target() -> str:
-    """What to give to pip to install the project, without extras."""
-    return "." if is_checkout() else DISTRIBUTION
-
-
 def install_command(extra: str = "") -> str:
-    """The command that installs the project, with one of its extras if one is named."""
-    return f"pip install '{install_target()}{f'[{extra}]' if extra else ''}'"
+    """The command that installs the project where it runs, with one of its extras if one is named.
+
+    The `pip` that a shell finds may belong to another Python, where `.venv/bin/cosim` was called by its path.
+    """
+    ours = Path(sys.executable)
+    found = shutil.which("pip")
+    pip = "pip" if found is not None and Path(found).parent == ours.parent else f"{_from_here(ours)} -m pip"
+    target = f"--editable '{_from_here(_PROJECT.parent)}" if is_checkout() else f"'{DISTRIBUTION}"
+    return f"{pip} install {target}{f'[{extra}]' if extra else ''}'"
+
+
+def _from_here(path: Path) -> Path:
+    """A path as it is shortest written in the working directory."""
+    try:
+        return path.relative_to(Path.cwd())
+    except (OSError, ValueError):  # elsewhere, or a working directory that is gone
+        return path
 
 
 def _look_up(line: str) -> Requirement:

@@ -11,6 +11,7 @@ import numpy as np
 
 from cosim.errors import CosimError, OutputError
 from cosim.pilots import TUNED_PURSUIT
+from cosim.requirements import install_command
 
 TITLE_SIZE: Final = 10
 """Of the figure's title (points)."""
@@ -25,7 +26,7 @@ def require_matplotlib() -> None:
         CosimError: matplotlib is not installed.
     """
     if find_spec("matplotlib") is None:
-        raise CosimError("--map needs matplotlib; install the extra with: pip install 'tube-cosim[view]'")
+        raise CosimError(f"--map needs matplotlib; install it with: {install_command('view')}")
 
 
 def draw_map(path: Path, report: dict[str, Any]) -> None:

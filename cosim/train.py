@@ -17,6 +17,7 @@ from agent_client.errors import TrainingOver
 from agent_client.tubes import LEVELS
 from cosim.errors import CosimError, OutputError, Terminated
 from cosim.figures import draw_figures
+from cosim.requirements import install_command
 from cosim.sessions import server_session
 from cosim.train_display import TrainingDisplay
 from cosim.walls import WallRegistry, wall_slots
@@ -140,7 +141,7 @@ def load_training() -> Callable[..., Path]:
         from agent_client.training import train as run
     except ImportError as error:
         raise CosimError(
-            f"training needs {error.name}; install the extra with: pip install 'tube-cosim[train]'"
+            f"training needs {error.name}; install it with: {install_command('train')}"
         ) from error
     return run
 

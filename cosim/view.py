@@ -12,11 +12,12 @@ import click
 
 from cosim import interrupts
 from cosim.errors import NoDisplayError, ViewError
-from cosim.film import INSTALL, check_outputs, write_film, write_picture
+from cosim.film import check_outputs, write_film, write_picture
 from cosim.live import counting, working
 from cosim.mesh_view import MeshChoice, draw_figure, put_up_mesh
 from cosim.options import SHIPPED_MESH
 from cosim.playback import Playback, View
+from cosim.requirements import install_command
 from cosim.scales import Quantity
 from cosim.tracks import Track, read_tracks
 from meshes.tube import INDUSTRIAL
@@ -113,7 +114,9 @@ def open_stage(
         try:
             from cosim.vedo_scene import Stage
         except ImportError as error:
-            raise ViewError(f"viewing needs {error.name or error}; {INSTALL}") from error
+            raise ViewError(
+                f"viewing needs {error.name or error}; install it with: {install_command('view')}"
+            ) from error
         return Stage(size, offscreen=offscreen, title=title, sky=sky, smooth=smooth)
 
 

@@ -225,7 +225,7 @@ def test_no_teacher_teaches_what_is_taken_away(jobs: list[Job]) -> None:
     ("arguments", "words"),
     [
         (("--variants", "full,no-wings"), ("--variants", "no-memory", "'no-wings'")),
-        (("--variants", ""), ("--variants", "found ''")),
+        (("--variants", ""), ("--variants", "an empty string")),
         (("--variants", "per-metre"), ("per-metre", "quick", "already")),
         (("--seeds", "0"), ("--seeds", "0")),
         (("--steps", "none"), ("--steps", "none")),

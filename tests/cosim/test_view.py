@@ -22,6 +22,7 @@ from cosim.drone_figure import CAMERA_COLOUR
 from cosim.live_senses import LiveSenses
 from cosim.mesh_view import OPENING_COLOUR
 from cosim.playback import AXIS_COLOUR, RUN_COLOURS
+from cosim.requirements import install_command
 from cosim.tracks import read_tracks
 from meshes.tube import read_tube
 
@@ -259,7 +260,7 @@ def test_without_vedo_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.Mon
     """A user who installed the core alone is told what to install."""
     monkeypatch.setitem(sys.modules, "vedo", None)
     monkeypatch.delitem(sys.modules, "cosim.vedo_scene", raising=False)
-    fails("--screenshot", tmp_path / "a.png", saying="pip install 'tube-cosim[view]'")
+    fails("--screenshot", tmp_path / "a.png", saying=install_command("view"))
 
 
 def test_a_window_without_a_display_says_what_to_do(runs: tuple[Path, Path], tmp_path: Path) -> None:
@@ -351,6 +352,9 @@ click(0.238, 0.06)
 print("view", playback.view)
 click(0.59, 0.06)
 print("slid", 10 < controls.moment < 20)
+stage._plotter.window.SetSize(600, 450)
+assert stage.pump()
+print("resized", stage.size)
 events.InvokeEvent("ExitEvent")
 print("open", stage.pump())
 stage.close()
@@ -370,6 +374,7 @@ def test_keys_buttons_and_slider_work_in_a_real_window(
         "button 3 False",
         "view follow",
         "slid True",
+        "resized (600, 450)",
         "open False",
     ]
 
