@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -63,7 +64,9 @@ def export(folder: Path, kind: str, output: Path | None = None) -> tuple[Path, s
             note = form.write(run, partial, done)
         partial.replace(target)
     except OSError as error:
-        raise OutputError(f"{target} cannot be written: {error.strerror}") from error
+        elsewhere = "; --out FILE writes it elsewhere" if output is None else ""
+        raise OutputError(f"{target} cannot be written: {error.strerror or error}{elsewhere}") from error
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # of a folder that cannot be written, where nothing was
+            partial.unlink(missing_ok=True)
     return target, note

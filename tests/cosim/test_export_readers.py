@@ -195,7 +195,7 @@ def test_a_usd_stage_of_a_long_flight_holds_fewer_poses_and_says_so(
     geometry = pytest.importorskip("pxr.UsdGeom")
     monkeypatch.setattr(export_scene, "MOST_POSES", 100)
     path, note = export(run.folder, "usd", tmp_path / "run.usdc")
-    assert f"every 5th of {len(run.records)} poses" in note
+    assert f"one in 5 of {len(run.records)} poses" in note
     stage = usd.Stage.Open(str(path))
     drone = geometry.Xformable(stage.GetPrimAtPath("/World/Drone"))
     kept = sorted({*range(0, len(run.records), 5), len(run.records) - 1})
