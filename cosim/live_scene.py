@@ -38,7 +38,7 @@ KEY: Final = (
     *SENSES_KEY,
 )
 """What the colours mean."""
-HELP: Final = "c camera   q close: the flight goes on   its way goes through the poses that were seen"
+HELP: Final = "c camera   q close: the flight goes on   way through the poses seen"
 TRIANGLES: Final = 60_000
 """Of the wall that is drawn at most; rays are computed with all of them."""
 TRAIL_POINTS: Final = 1500

@@ -191,7 +191,8 @@ class LiveView:
         self._told = True
         errors.seek(0)
         words = errors.read().decode(errors="replace").strip().splitlines()
-        why = words[-1] if words else describe_exit(code)
+        # What is set in belongs to the line above it, which says more.
+        why = next((line for line in reversed(words) if not line[:1].isspace()), describe_exit(code))
         self._say(f"live view: {why}; {then}")
 
 

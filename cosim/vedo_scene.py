@@ -29,8 +29,8 @@ from protocol.signals import held_signals
 Floats = NDArray[np.float64]
 FONT: Final = "Calco"
 INK: Final = "#22303c"
-LETTER: Final = 12.6
-"""Width of a letter of `FONT` at size 1 (pixels)."""
+LETTER: Final = 0.57
+"""Width of a letter of `FONT` over its height."""
 
 _OSMESA: Final = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
 
@@ -98,8 +98,10 @@ class Stage:
         self._plotter = vedo.Plotter(
             size=size, offscreen=offscreen, title=title, bg=sky[0], bg2=sky[1], interactive=False
         )
-        self._unit = min(size[1] / 600.0, size[0] / 800.0)
+        self._unit = _unit(size)
         """Texts grow with the picture."""
+        self._fits: list[Callable[[], object]] = []
+        """What gives them their size, and must be done again in a window of another size."""
         self._begun = self._closed = False
 
     def wall(self, surface: Surface, colour: str, *, cut: bool, ghost: float = 0.1) -> None:
@@ -149,13 +151,18 @@ class Stage:
         line.add_scalarbar(
             scale.title,
             pos=((0.885, 0.08), (0.975, 0.5)),
-            font_size=int(14 * self._unit),
-            title_yoffset=int(12 * self._unit),
             nlabels=5,
             label_format=":.2f",
             c=INK,
         )
         bar = line.scalarbar
+
+        def fit() -> None:
+            for words in (bar.GetTitleTextProperty(), bar.GetLabelTextProperty()):
+                words.SetFontSize(int(14 * self._unit))
+            bar.SetVerticalTitleSeparation(int(12 * self._unit))
+
+        self._fit(fit)
         bar.SetDrawBackground(True)
         bar.GetBackgroundProperty().SetColor(1.0, 1.0, 1.0)
         bar.GetBackgroundProperty().SetOpacity(0.55)
@@ -167,7 +174,8 @@ class Stage:
 
     def text(self, words: str, place: str, *, size: float = 1.0, colour: str = INK) -> Callable[[str], None]:
         """Write at a place such as "top-left"; returns what changes the words."""
-        text = vedo.Text2D(words, pos=place, s=size * self._unit, c=colour, font=FONT, bg="white", alpha=0.55)
+        text = vedo.Text2D(words, pos=place, c=colour, font=FONT, bg="white", alpha=0.55)
+        self._fit(lambda: text.size(size * self._unit))
         self._plotter.add(text)
         return text.text  # type: ignore[no-any-return]
 
@@ -184,13 +192,15 @@ class Stage:
     def legend(self, entries: Sequence[tuple[str, str]], *, size: float = 0.65) -> None:
         """Name colours at the top right: (name, colour) of each."""
         columns = 4 + max(len(name) for name, _ in entries)
-        place = (0.995 - size * self._unit * LETTER * columns / self.size[0], 0.995)
 
         def write(words: str, colour: str, box: float) -> None:
-            text = vedo.Text2D(
-                words, pos=place, s=size * self._unit, c=colour, font=FONT, bg="white", alpha=box,
-                justify="top-left", bold=box == 0.0,
-            )  # fmt: skip
+            text = vedo.Text2D(words, c=colour, font=FONT, bg="white", alpha=box, bold=box == 0.0)
+
+            def fit() -> None:
+                letter = LETTER * text.size(size * self._unit).properties.GetFontSize()
+                text.pos((0.995 - letter * columns / self.size[0], 0.995), "top-left")
+
+            self._fit(fit)
             self._plotter.add(text)
 
         write("\n".join(f"   {name}" for name, _ in entries), INK, 0.55)
@@ -226,6 +236,7 @@ class Stage:
         if not self._closed:
             with held_signals():  # VTK ends the process at once where Ctrl-C is raised out of a handler
                 self._plotter.interactor.ProcessEvents()
+                self._follow_window()
         return not self._closed
 
     def on_key(self, handler: Callable[[str], None]) -> None:
@@ -264,10 +275,10 @@ class Stage:
             c=["white"] * len(words),
             bc=[INK] * len(words),
             pos=place,
-            size=int(17 * self._unit),
             font=FONT,
             bold=False,
         )
+        self._fit(lambda: button.size(0.85 * self._unit))
         return button.status  # type: ignore[no-any-return]
 
     def close(self) -> None:
@@ -279,6 +290,19 @@ class Stage:
         self._plotter.add(mesh)
         return Shape(mesh)
 
+    def _fit(self, fit: Callable[[], object]) -> None:
+        fit()
+        self._fits.append(fit)
+
+    def _follow_window(self) -> None:
+        """Fit the texts to the window where it was given another size."""
+        size = tuple(self._plotter.window.GetSize())
+        if size != self.size and min(size) > 0:
+            self.size, self._unit = size, _unit(size)
+            for fit in self._fits:
+                fit()
+            self._plotter.render()
+
     def _begin(self) -> None:
         if not self._begun:
             self._plotter.show(resetcam=False, interactive=False)
@@ -289,6 +313,10 @@ class Stage:
 
     def _end(self, _caller: object, _event: str) -> None:
         self._closed = True
+
+
+def _unit(size: tuple[int, int]) -> float:
+    return min(size[1] / 600.0, size[0] / 900.0)
 
 
 def _prepare(offscreen: bool) -> None:
