@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from meshes.errors import MeshReadError
 from meshes.geometry import Floats
+from meshes.polygons import triangulate
 
 Ints = NDArray[np.int32]
 
@@ -35,7 +36,7 @@ class ObjData:
     vertices: Floats  # (V, 3)
     """In the file's own axes and unit."""
     faces: Ints  # (F, 3)
-    """Triangles; a polygon is cut into a fan from its first corner. Exact duplicates are dropped."""
+    """Triangles, see `triangulate`. Exact duplicates of polygons are dropped."""
     segments: Ints  # (S, 2)
     """The two vertices of every line segment, in file order. Exact duplicates are dropped."""
     objects: tuple[str, ...]
@@ -97,7 +98,7 @@ def parse_obj(content: bytes, path: Path) -> ObjData:
     polylines = _elements(lines["l"], lines["v"], len(vertices), name_lines, 2, path)
 
     welded = weld(vertices)
-    triangles, face_object, duplicate_faces = _triangles(faces, welded)
+    triangles, face_object, duplicate_faces = _triangles(faces, vertices, welded)
     segments, segment_object, duplicate_segments = _segments(polylines, welded)
     return ObjData(
         vertices=vertices,
@@ -245,8 +246,8 @@ def _refuse_elements(
     raise MeshReadError(f"{path}: expected vertex numbers after {keyword!r}, found what cannot be read")
 
 
-def _triangles(faces: _Elements, places: NDArray[np.int64]) -> tuple[Ints, Ints, int]:
-    """Fans of the polygons that are no duplicates, with their objects, and how many were dropped.
+def _triangles(faces: _Elements, vertices: Floats, places: NDArray[np.int64]) -> tuple[Ints, Ints, int]:
+    """The polygons that are no duplicates as triangles, with their objects, and how many were dropped.
 
     Polygons are compared, not triangles: the same quad cut along its other diagonal is a duplicate too.
     """
@@ -258,8 +259,7 @@ def _triangles(faces: _Elements, places: NDArray[np.int64]) -> tuple[Ints, Ints,
         polygons = faces.corners[starts[rows][:, None] + np.arange(size)]
         kept = first_of_each(places[polygons])
         dropped += len(rows) - len(kept)
-        fan = polygons[kept][:, [[0, i, i + 1] for i in range(1, size - 1)]]  # (P, size - 2, 3)
-        triangles.append(fan.reshape(-1, 3))
+        triangles.append(triangulate(vertices, polygons[kept]).reshape(-1, 3))
         owners.append(np.repeat(faces.owners[rows[kept]], size - 2))
         order.append(np.repeat(rows[kept], size - 2))
     if not triangles:
