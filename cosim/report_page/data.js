@@ -60,7 +60,7 @@ const REGIMES = ["", "visible", "memory", "blind"];
 /** A number for people: `digits` significant ones, a true minus sign, a dash for what is not known. */
 function say(value, digits = 3) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
-  if (Math.abs(value) < 5e-7) return "0";
+  if (Math.abs(value) < 5e-6) return "0";
   const size = Math.floor(Math.log10(Math.abs(value)));
   const text = size >= digits ? Math.round(value).toLocaleString("en") : value.toFixed(Math.min(digits - 1 - size, 6));
   return text.replace("-", "−");

@@ -113,6 +113,7 @@ class View {
     this.controls.enableDamping = false;
     this._letScroll();
     this.controls.addEventListener("change", () => this.redraw());
+    this.controls.addEventListener("start", () => (this.turned = true));
     this.layers = { path: true, axis: true, rays: true, cone: true, target: true };
     this.tubeMode = "glass";
     this.cameraMode = "overview";
@@ -193,6 +194,7 @@ class View {
   /** Look at the whole tube, follow the drone in focus, or look out of it. */
   setCamera(mode) {
     this.cameraMode = mode;
+    this.turned = false;
     const camera = this.camera,
       drone = this.runs[this.focus.number].drone;
     this.controls.enabled = mode !== "aboard";
@@ -313,6 +315,7 @@ class View {
     this._size(this.ratio);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
+    if (this.cameraMode === "overview" && !this.turned && this.time !== undefined) this.setCamera("overview");
     this.redraw();
   }
 

@@ -375,6 +375,25 @@ def test_it_fits_a_phone(browser: Browser, which: str, request: pytest.FixtureRe
         assert box["width"] >= 34
 
 
+def test_the_whole_tube_is_seen_in_a_window_of_any_shape(drawn: Browser) -> None:
+    """However the window is turned, the overview holds every corner of the tube, which it fills."""
+    farthest = (
+        "await new Promise((done) => setTimeout(done, 200));"
+        "const { camera } = report.view, tube = report.data.tubes[0].vertices;"
+        "const place = new camera.position.constructor(); let far = 0;"
+        "camera.updateMatrixWorld();"
+        "for (let i = 0; i < tube.length; i += 3) {"
+        "  place.fromArray(tube, i).project(camera);"
+        "  far = Math.max(far, Math.abs(place.x), Math.abs(place.y)); }"
+        "return far"
+    )
+    drawn.run("report.view.setCamera('overview')")
+    for width, height in ((390, 844), (844, 390), (1000, 600)):
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        drawn.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+        assert 0.6 < drawn.run(farthest) < 1.0
+
+
 def test_dark_mode_changes_page_and_view(browser: Browser, page: Path) -> None:
     """Dark ground and light text where the system is dark, in the 3-D view as well; also while it is open."""
     colours = (
