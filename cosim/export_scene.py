@@ -139,8 +139,9 @@ class _Gltf:
         )
 
     def line(self, name: str, points: int, colour: Colour) -> None:
-        """Add a line through the points of an accessor."""
-        self._node(name, points, colour, {"mode": _LINE_STRIP})
+        """Add a line through the points of an accessor; of a single point none, which importers fail at."""
+        if self._accessors[points]["count"] > 1:
+            self._node(name, points, colour, {"mode": _LINE_STRIP})
 
     def points(self, points: Floats) -> int:
         """Add places (N, 3); returns their accessor."""
@@ -290,6 +291,8 @@ def _usd_mesh(stage: Any, name: str, surface: Surface, colour: Colour) -> Any:
 def _usd_line(stage: Any, name: str, points: Floats, colour: Colour) -> None:
     from pxr import UsdGeom
 
+    if len(points) < 2:
+        return
     curve = UsdGeom.BasisCurves.Define(stage, f"/World/{name}")
     curve.CreateTypeAttr(UsdGeom.Tokens.linear)
     curve.CreatePointsAttr(_usd_vectors(points))

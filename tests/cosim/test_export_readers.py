@@ -219,6 +219,26 @@ def test_a_run_that_was_cut_short_and_moved_is_exported(run: Run, tmp_path: Path
     assert sorted(p.name for p in folder.iterdir()) == sorted(["manifest.json", "steps.bin", path.name])
 
 
+@pytest.mark.parametrize("kind", ["gltf", "usd"])
+def test_a_run_of_its_reset_alone_is_a_scene_without_lines(run: Run, tmp_path: Path, kind: str) -> None:
+    """Importers fail at a line through a single point; the tube and the drone stand there all the same."""
+    shutil.copy(run.folder / "manifest.json", tmp_path / "manifest.json")
+    (tmp_path / "steps.bin").write_bytes(
+        (run.folder / "steps.bin").read_bytes()[: run.records.dtype.itemsize]
+    )
+    path, _ = export(tmp_path, kind)
+    if kind == "gltf":
+        names = {
+            mesh["name"] for mesh in json.loads(path.read_bytes()[20:].split(b"BIN\0")[0][:-4])["meshes"]
+        }
+    else:
+        stage = pytest.importorskip("pxr.Usd").Stage.Open(str(path))
+        names = {prim.GetName().lower() for prim in stage.GetPrimAtPath("/World").GetChildren()} - {
+            "materials"
+        }
+    assert names == {"tube", "drone"}
+
+
 LONG = """
 import resource, sys
 from pathlib import Path
