@@ -1,7 +1,7 @@
 """Mesh files of every format that is read: their triangles, and the unit and up-axis that they state.
 
-An .obj is read by `meshes.obj`, the others by trimesh, which applies the transforms of scenes, but neither the
-unit nor the up-axis of a .dae.
+An .obj is read by `meshes.obj`, a .ply by `meshes.ply`, the others by trimesh, which applies the transforms of
+scenes, but neither the unit nor the up-axis of a .dae.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from meshes.errors import MeshReadError
 from meshes.geometry import Floats
 from meshes.gltf import read_buffers, read_document
 from meshes.obj import first_of_each, parse_obj, weld
+from meshes.ply import parse_ply
 
 Axes = Literal["zup", "yup"]
 """Which way a file points: "zup" as the world; "yup" as Blender's export writes by default, (x, z, -y)."""
@@ -91,7 +92,10 @@ def parse_mesh(content: bytes, path: Path) -> MeshData:
     if suffix == ".stl":
         content = _whole_stl(content, path)
     buffers = read_buffers(read_document(content, path), path) if suffix in (".glb", ".gltf") else {}
-    vertices, faces = _parse_by_trimesh(content, path, buffers)
+    if suffix == ".ply":
+        vertices, faces = parse_ply(content, path)
+    else:
+        vertices, faces = _parse_by_trimesh(content, path, buffers)
     if not np.isfinite(vertices).all():
         raise MeshReadError(f"{path}: expected finite coordinates, found NaN or infinity")
     places = weld(vertices)

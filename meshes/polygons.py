@@ -45,7 +45,8 @@ def _flat(corners: Floats, normal: Floats) -> Floats:
     normal = normal / np.linalg.norm(normal)
     across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     across /= np.linalg.norm(across)
-    return corners @ np.stack([across, np.cross(normal, across)], axis=1)
+    flat: Floats = corners @ np.stack([across, np.cross(normal, across)], axis=1)
+    return flat
 
 
 def _cut_ears(corners: Floats) -> list[tuple[int, int, int]]:

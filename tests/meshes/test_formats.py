@@ -231,6 +231,39 @@ def test_a_bend_is_found_in_every_format(suffix: str, tmp_path: Path) -> None:
     assert read_tube(path, axes="zup").length == pytest.approx(4.0 * np.pi, abs=0.15)
 
 
+@pytest.mark.parametrize("order", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_a_ply_has_polygons_of_any_size(order: str, tmp_path: Path) -> None:
+    """A box of a pentagon's section, as Blender writes one: quads and pentagons side by side, further properties of
+    vertices and faces, and faces before vertices."""
+    ring = circle(5)
+    vertices = np.array([(x, y, z) for x in (0.0, 3.0) for y, z in ring])
+    faces = [[*range(5)], [*range(9, 4, -1)], *([i, i + 5, (i + 1) % 5 + 5, (i + 1) % 5] for i in range(5))]
+    header = (
+        f"ply\nformat {order} 1.0\ncomment made\nelement face 7\nproperty uchar shade\n"
+        "property list uchar int vertex_index\nelement vertex 10\nproperty double x\nproperty double y\n"
+        "property double z\nproperty float s\nend_header\n"
+    )
+    if order == "ascii":
+        lines = [f"7 {len(face)} {' '.join(map(str, face))}" for face in faces]
+        lines += [f"{x:.9g} {y:.9g} {z:.9g} 0.5" for x, y, z in vertices]
+        body = "\n".join(lines).encode()
+    else:
+        sign = "<" if order == "binary_little_endian" else ">"
+        body = b"".join(struct.pack(f"{sign}BB{len(face)}i", 7, len(face), *face) for face in faces)
+        body += b"".join(struct.pack(f"{sign}dddf", *vertex, 0.5) for vertex in vertices)
+    path = tmp_path / "box.ply"
+    path.write_bytes(header.encode() + body)
+    wall = read_wall(path)
+    assert len(wall.faces) == 2 * 3 + 5 * 2
+    np.testing.assert_allclose(np.unique(wall.vertices, axis=0), np.unique(vertices, axis=0), atol=1e-8)
+    a, b, c = (wall.vertices[wall.faces[:, k]] for k in range(3))
+    volume = abs((np.cross(a, b) * c).sum()) / 6.0
+    assert volume == pytest.approx(3.0 * 2.5 * np.sin(2.0 * np.pi / 5.0))
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(MeshReadError, match="cut short"):
+        read_wall(path)
+
+
 def _truncated(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:200])
 
