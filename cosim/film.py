@@ -107,7 +107,9 @@ def _write_mp4(path: Path, frames: Iterator[Image], rate: float) -> None:
 def _write_gif(path: Path, frames: Iterator[Image], rate: float) -> None:
     from PIL import Image as Pillow
 
-    pictures = (Pillow.fromarray(frame).quantize(128) for frame in frames)
+    # The usual median cut gives all colours of a palette to sky and wall, and none to a thin line.
+    octree = Pillow.Quantize.FASTOCTREE
+    pictures = (Pillow.fromarray(frame).quantize(256, method=octree) for frame in frames)
     next(pictures).save(
         path, save_all=True, append_images=pictures, duration=max(20, round(1000.0 / rate)), loop=0
     )

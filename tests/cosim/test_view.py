@@ -129,6 +129,9 @@ def test_several_runs_are_overlaid_each_in_its_colour(runs: tuple[Path, Path], t
         assert film.format == "GIF"
         assert film.n_frames == STEPS // 10 + 1  # type: ignore[attr-defined]
         assert film.size == (640, 400)
+        frame = np.asarray(film.convert("RGB")).astype(np.int64)
+    for colour in (*RUN_COLOURS[:2], CAMERA_COLOUR):
+        assert count(frame[100:], colour) >= 10, "a palette of few colours keeps those of thin lines"
     done = view(*runs, *large, "speed.png", "--colour", "speed", cwd=tmp_path)
     assert done.status == 0, done.stderr
     speed = read(tmp_path / "speed.png")
