@@ -7,7 +7,7 @@ import json
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,19 @@ from cosim.recording import Column
 from cosim.requirements import install_command
 from cosim.runs import Run, chunks, element_names
 
+CHAIN: Final = "chain"
+
 Done = Callable[[float], None]
 
 
+def _names(column: Column) -> list[str]:
+    """Names of the columns that a field becomes; a link of the chain is one, in hexadecimal as in the manifest."""
+    return [CHAIN] if column.name == CHAIN else element_names(column)
+
+
 def _scalars(records: NDArray[np.void], column: Column) -> list[NDArray[Any]]:
+    if column.name == CHAIN:
+        return [np.array([link.tobytes().hex() for link in records[CHAIN]])]
     values = records[column.name].reshape(len(records), -1)
     return [values[:, i] for i in range(values.shape[1])]
 
@@ -29,7 +38,7 @@ def write_csv(run: Run, target: Path, done: Done) -> str:
     """Write one row a record, with every number exact; nothing is lost."""
     with target.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow([name for c in run.columns for name in element_names(c)])
+        writer.writerow([name for c in run.columns for name in _names(c)])
         for records in chunks(run):
             columns = [scalar.tolist() for c in run.columns for scalar in _scalars(records, c)]
             writer.writerows(zip(*columns, strict=True))
@@ -68,13 +77,13 @@ def write_parquet(run: Run, target: Path, done: Done) -> str:
         import pyarrow.parquet as pq
     except ImportError as error:
         raise CosimError(f"Parquet needs pyarrow; install it with: {install_command('export')}") from error
-    described = {name: {"unit": c.unit, "frame": c.frame} for c in run.columns for name in element_names(c)}
+    described = {name: {"unit": c.unit, "frame": c.frame} for c in run.columns for name in _names(c)}
+
+    def kind(column: Column) -> Any:
+        return pa.string() if column.name == CHAIN else pa.from_numpy_dtype(np.dtype(column.type))
+
     schema = pa.schema(
-        [
-            pa.field(name, pa.from_numpy_dtype(np.dtype(c.type)), metadata=described[name])
-            for c in run.columns
-            for name in element_names(c)
-        ],
+        [pa.field(name, kind(c), metadata=described[name]) for c in run.columns for name in _names(c)],
         # Of the file and not of a column alone: Polars and DuckDB show no other.
         metadata={"cosim.manifest": json.dumps(run.manifest), "cosim.columns": json.dumps(described)},
     )

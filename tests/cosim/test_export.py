@@ -53,6 +53,7 @@ def test_csv_is_read_back_by_the_csv_module(run: Run, tmp_path: Path) -> None:
     assert len(rows) == len(run.records)
     assert [float(row["position_z"]) for row in rows] == run.records["position"][:, 2].tolist()
     assert [float(row["quaternion_w"]) for row in rows] == run.records["quaternion"][:, 3].tolist()
+    assert rows[-1]["chain"] == run.manifest["trajectory_hash"]
     assert [int(row["action"]) for row in rows] == run.records["action"].tolist()
 
 
@@ -71,7 +72,9 @@ def test_parquet_is_read_back_by_pyarrow_with_units(run: Run, tmp_path: Path) ->
     assert table["position_x"].to_pylist() == run.records["position"][:, 0].tolist()
     assert table.schema.field("position_x").metadata == {b"unit": b"m", b"frame": b"world"}
     assert json.loads(table.schema.metadata[b"cosim.manifest"])["format"] == 2
+    assert table["chain"][-1].as_py() == run.manifest["trajectory_hash"]
     described = json.loads(table.schema.metadata[b"cosim.columns"])
+    assert set(described) == set(table.column_names)
     assert described["angular_velocity_z"] == {"unit": "rad/s", "frame": "world"}
 
 
