@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 import traceback
@@ -80,6 +81,8 @@ for _command in (
 def main() -> None:
     """Entry point of the console script; every error raised on purpose is one sentence on stderr."""
     interrupts.listen()
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may not have every letter; stderr is so already
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         status = _run()
     finally:

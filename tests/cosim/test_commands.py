@@ -128,6 +128,16 @@ def test_output_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (141, "")
 
 
+def test_letters_that_a_terminal_lacks_are_no_fault(tmp_path: Path) -> None:
+    """Output in Latin 1, which has no ellipsis and no dash: written in another way."""
+    done = subprocess.run(
+        command("train", "--explain"), check=False, capture_output=True, cwd=tmp_path, timeout=DEADLINE,
+        env=environment() | {"PYTHONIOENCODING": "latin-1"},
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"\\u2" in done.stdout
+
+
 def test_help_waits_for_no_heavy_import(tmp_path: Path) -> None:
     """`cosim --help` loads neither numpy nor anything that takes as long."""
     heavy = "{'numpy', 'numba', 'rich', 'vedo'}"
