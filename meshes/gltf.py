@@ -15,6 +15,9 @@ from meshes.obj import read_bytes
 COMPRESSIONS: Final = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
 """Extensions without which the vertices of a file cannot be read."""
 
+INSTANCING: Final = "EXT_mesh_gpu_instancing"
+"""An extension that puts one mesh into many places, of which one would be read."""
+
 TRIANGLE_FAN: Final = 6
 """Mode of a primitive that is not read."""
 
@@ -49,6 +52,10 @@ def _check(document: Any, path: Path) -> None:
             raise MeshReadError(
                 f"{path}: expected vertices that are not compressed, found {name}; export it without compression"
             )
+    if INSTANCING in document.get("extensionsUsed", ()):
+        raise MeshReadError(
+            f"{path}: expected a node for each place of a mesh, found {INSTANCING}; export it without instancing"
+        )
     accessors = document.get("accessors", [])
     for mesh in document.get("meshes", ()):
         for primitive in mesh["primitives"]:

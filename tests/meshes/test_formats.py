@@ -144,6 +144,7 @@ def test_a_gltf_is_all_of_its_files(tmp_path: Path) -> None:
     ("change", "words"),
     [
         ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "KHR_draco_mesh_compression"),
+        ({"extensionsUsed": ["EXT_mesh_gpu_instancing"]}, "without instancing"),
         ({"accessors": [{"normalized": True}, {}]}, "quantised"),
         ({"meshes": [{"primitives": [{"mode": 6, "attributes": {"POSITION": 0}}]}]}, "fan"),
         ({"buffers": [{"byteLength": 1, "uri": "https://example.org/a.bin"}]}, "beside it"),
