@@ -18,13 +18,15 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree  # type: ignore[import-untyped]
 
 from meshes.centring import centre_path, to_the_end
 from meshes.closest import distances_to_wall
 from meshes.curves import arc_lengths
 from meshes.errors import CentrelineError
 from meshes.geometry import Bools, Floats
-from meshes.lumen import Balls, draw_balls, shortest_way
+from meshes.lumen import Balls, draw_balls, look_around, shortest_way, sphere
 from meshes.openings import Opening
 from meshes.sections import measure_rings, resample_evenly
 from meshes.swept import unit_tangents
@@ -36,6 +38,12 @@ AT_THE_END: Final = 2.0
 """A point that is named so many radii before the end of the tube stands for the end."""
 EVEN_STEP: Final = 0.2
 """Step of a found centreline at most, over the radius where the tube is narrow."""
+OBSTRUCTED: Final = 0.35
+"""Where less than this share of the usual room is left, the way of the balls may be better."""
+DETOUR: Final = 1.5
+"""It is left and reached again so many radii before and behind."""
+AVOIDING: Final = 30
+"""Times that it is moved off what stands in the way."""
 LEAST_CLEARANCE: Final = 0.15
 """A place with less room than this share of the usual is pinched."""
 MOST_OPEN: Final = 1.0 / 6.0
@@ -58,7 +66,7 @@ class FoundCentreline:
     radius: float
     """Median distance of the wall from the centreline (m)."""
     openings: tuple[Opening, ...]
-    """All that were found, used or not, the nearest to the origin first; it has the number 1."""
+    """All that were found, used or not, by their numbers from 1: the nearest to the origin first."""
     used: tuple[int | None, int | None]
     """Numbers of the openings at which it starts and ends; None at a cap, or inside of the tube."""
     capped: tuple[bool, bool]
@@ -95,7 +103,7 @@ def find_centreline(wall: Wall, entry: Place | None = None, exit: Place | None =
     points, capped = _centre(wall, lumen.balls.take(way), openings, (entry, exit))
     dense, distances = _clearances(wall, points)
     radius = float(np.median(distances))
-    notes = _open_places(wall, points, radius) + _notes(wall, holes)
+    notes = _open_places(wall, points, radius) + _notes(wall, openings, holes, capped)
     _refuse_pinched(wall, dense, distances)
     used = _used(openings, points, radius, capped)
     return FoundCentreline(points, radius, tuple(openings), used, capped, notes)
@@ -125,8 +133,8 @@ def _centre(
             if before > AT_THE_END * way.radii[-end]:
                 longer, capped[end] = points, False
         points = longer[::-1]
-    points = _within_walls(wall, points)
-    return resample_evenly(points, EVEN_STEP * float(np.quantile(way.radii, 0.2))), (capped[0], capped[1])
+    points = resample_evenly(_within_walls(wall, points), EVEN_STEP * float(np.quantile(way.radii, 0.2)))
+    return _past_obstacles(wall, points, way), (capped[0], capped[1])
 
 
 def _within_walls(wall: Wall, points: Floats) -> Floats:
@@ -143,6 +151,45 @@ def _clearances(wall: Wall, points: Floats) -> tuple[Floats, Floats]:
     spacing = float(np.linalg.norm(points[1] - points[0]))
     dense = resample_evenly(points, spacing / 4.0)
     return dense, distances_to_wall(dense, wall.vertices, wall.faces)
+
+
+def _past_obstacles(wall: Wall, points: Floats, way: Balls) -> Floats:
+    """Evenly spaced points (P, 3); where something stands in the middle of the tube, past it by the way of the balls.
+
+    The middle of a section says nothing of a thin plate between two sections.
+    """
+    dense, distances = _clearances(wall, points)
+    usual = float(np.median(distances))
+    ends = np.linalg.norm(dense[:, None] - points[[0, -1]], axis=2).min(axis=1) < usual
+    narrow = dense[(distances < OBSTRUCTED * usual) & ~ends]
+    if not len(narrow):
+        return points
+    moved, tree = points.copy(), cKDTree(way.centres)
+    near = cKDTree(narrow).query(points)[0] < DETOUR * usual
+    for first, stop in _runs(near):
+        balls = tree.query(points[[first, stop - 1]])[1]
+        if stop - first > 2 and balls[1] > balls[0] + 1:
+            part = way.centres[balls[0] : balls[1] + 1]
+            along = arc_lengths(part)
+            wanted = np.linspace(0.0, along[-1], stop - first)
+            moved[first:stop] = np.stack([np.interp(wanted, along, part[:, k]) for k in range(3)], axis=1)
+    changed = np.flatnonzero(near)
+    changed = changed[(changed > 0) & (changed < len(points) - 1)]
+    for _ in range(AVOIDING):
+        looks = look_around(wall.scene, moved[changed])
+        least = looks.min(axis=1)
+        away = -sphere(looks.shape[1])[np.argmin(looks, axis=1)]
+        along = unit_tangents(moved)[changed]
+        away -= (away * along).sum(axis=1, keepdims=True) * along
+        push = np.clip(0.5 * usual - least, 0.0, 0.1 * usual)[:, None] * away
+        smooth = 0.5 * (moved[changed - 1] + moved[changed + 1]) - moved[changed]
+        moved[changed] += push + 0.5 * smooth
+    if (
+        _clearances(wall, moved)[1].min() <= distances.min()
+        or wall.scene.blocked(moved[:-1], moved[1:]).any()
+    ):
+        return points
+    return resample_evenly(moved, float(np.linalg.norm(points[1] - points[0])))
 
 
 def _refuse_pinched(wall: Wall, dense: Floats, distances: Floats) -> None:
@@ -187,10 +234,14 @@ def _open_places(wall: Wall, points: Floats, radius: float) -> tuple[str, ...]:
 
 def _longest(chosen: Bools, along: Floats) -> tuple[int, int]:
     """First point of the longest run of chosen ones (M,), and the one behind its last, by arc length (M,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(np.int8), [0]])))
-    runs = edges.reshape(-1, 2)
+    runs = _runs(chosen)
     first, stop = runs[np.argmax(along[runs[:, 1] - 1] - along[runs[:, 0]])]
     return int(first), int(stop)
+
+
+def _runs(chosen: Bools) -> NDArray[np.int64]:
+    """First point of each run of chosen ones (M,), and the one behind its last, (R, 2)."""
+    return np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(np.int8), [0]]))).reshape(-1, 2)
 
 
 def _used(
@@ -206,7 +257,12 @@ def _used(
     return used[0], used[1]
 
 
-def _notes(wall: Wall, holes: list[Opening]) -> tuple[str, ...]:
-    if not holes:
-        return ()
-    return (f"{len(holes)} holes or slits in the wall, one near {place(wall, holes[0].centre)}",)
+def _notes(
+    wall: Wall, openings: list[Opening], holes: list[Opening], capped: tuple[bool, bool]
+) -> tuple[str, ...]:
+    notes = []
+    if all(capped) and not openings:
+        notes.append("closed all around: read as a tube with two caps, which a solid bar looks like too")
+    if holes:
+        notes.append(f"{len(holes)} holes or slits in the wall, one near {place(wall, holes[0].centre)}")
+    return tuple(notes)

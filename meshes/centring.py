@@ -41,6 +41,9 @@ SMOOTHING: Final = 0.75
 """A cubic is laid through the points within so many radii ahead and behind."""
 TANGENT: Final = 1.2
 """The same for tangents: a section that turned with every move of its point would never come to rest."""
+FLARE: Final = 0.4
+"""Where the radius changes by more than this, by the way, points are moved less: in a cone the centre of a section
+moves with its tilt, and would take the path with it."""
 FIRST_SMOOTHING: Final = 2.0
 """The same for the rough path."""
 BLIND: Final = 1.0
@@ -87,7 +90,8 @@ def centre_path(scene: RayScene, path: Floats, radii: Floats, mouths: Mouths) ->
         rings = measure_rings(scene, points, _held_tangents(points, mouths))
         closed = close_sideways(rings.distances, STEP)
         radii = closed.mean(axis=1)
-        moved = _keep_free(scene, points, points + gain * offsets_of_centres(rings, closed))
+        calm = np.minimum((FLARE / np.maximum(_slopes(points, radii), 1e-9)) ** 2, 1.0)[:, None]
+        moved = _keep_free(scene, points, points + gain * calm * offsets_of_centres(rings, closed))
         moved = _keep_free(scene, moved, _smooth(moved, SMOOTHING))
         if number >= CALM_AFTER:
             moved[:ENDS], moved[-ENDS:] = points[:ENDS], points[-ENDS:]
@@ -198,6 +202,12 @@ def _tangents(points: Floats) -> Floats:
     along = fit_locally(points, window, 3, derivative=1)
     tangents: Floats = along / np.linalg.norm(along, axis=1, keepdims=True)
     return tangents
+
+
+def _slopes(points: Floats, radii: Floats) -> Floats:
+    """How fast the radius (M,) changes by the way along points (M, 3), (M,)."""
+    slopes: Floats = np.abs(np.gradient(radii)) / np.linalg.norm(np.gradient(points, axis=0), axis=1)
+    return slopes
 
 
 def _held_tangents(points: Floats, mouths: Mouths) -> Floats:

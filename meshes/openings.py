@@ -40,7 +40,7 @@ the same opening."""
 GOES_ON: Final = 5
 """Balls of the same space in sight in front of an opening that make it none; a few may lie in a corner there."""
 NARROW: Final = 0.35
-"""An opening narrower than so many radii of the tube is a hole in its wall."""
+"""An opening narrower than so many radii of the tube, by the looks that leave through it, is a hole in its wall."""
 INSIDE: Final = 0.5
 """So many radii inside of an opening its section is measured."""
 CENTRED: Final = 8
@@ -66,11 +66,11 @@ class Opening:
 
 
 def find_openings(scene: RayScene, lumen: Lumen) -> tuple[list[Opening], list[Opening]]:
-    """The openings of a space, and the holes and slits in its wall; both the nearest to the origin first."""
+    """The openings of a space, and the holes and slits in its wall."""
     points, ways, radii, wide = _leave(scene, _large(lumen))
     openings, holes = [], []
     for opening, radius in _bundles(scene, points[wide], ways[wide], radii[wide]):
-        if _within(scene, lumen, opening, radius):
+        if _within(scene, lumen, opening, max(radius, opening.radius)):
             continue
         if NARROW * radius < opening.radius < SLIT * radius:
             openings.append(_in_section(scene, opening, radius))
@@ -80,8 +80,6 @@ def find_openings(scene: RayScene, lumen: Lumen) -> tuple[list[Opening], list[Op
         apart = [float(np.linalg.norm(hole.centre - o.centre)) - o.radius for o in (*openings, *holes)]
         if min(apart, default=np.inf) > radius and not _within(scene, lumen, hole, radius):
             holes.append(hole)
-    for found in (openings, holes):
-        found.sort(key=lambda opening: float(np.linalg.norm(opening.centre)))
     return openings, holes
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cmp_to_key
 from typing import Final
 
 import numpy as np
@@ -24,6 +25,8 @@ COMPARABLE: Final = 0.25
 """A second tube at least so long, over the first, and half as wide, makes it unclear which is meant."""
 NEAR: Final = 3.0
 """A point that is named may lie so many radii from the nearest ball, and an end so many from its opening."""
+SAME_PLACE: Final = 0.5
+"""Coordinates of openings that differ by less than so many radii are the same."""
 BEHIND_WALL: Final = 0.5
 """A point that is named may lie behind a wall so many radii from the nearest ball."""
 FACING: Final = 0.7
@@ -58,6 +61,7 @@ def choose_lumen(wall: Wall, balls: Balls, named: list[Floats]) -> _Choice:
             if largest is not lumens and not named and not _is_tube_in(lumen, largest):
                 continue
             openings, holes = find_openings(wall.scene, lumen)
+            openings = _numbered(wall, openings, lumen.radius)
             choice = lumen, [other for other in lumens if other is not lumen], openings, holes
             long = lumen.length > HOLLOW * lumen.balls.radii.max()
             if named or len(openings) > 1 or (openings and long):
@@ -68,6 +72,25 @@ def choose_lumen(wall: Wall, balls: Balls, named: list[Floats]) -> _Choice:
     if not (largest and named):
         raise CentrelineError(_no_tube(wall, balls))
     raise CentrelineError(_not_between(wall, largest, named))
+
+
+def _numbered(wall: Wall, openings: list[Opening], radius: float) -> list[Opening]:
+    """Openings of a tube of some radius (m) in the order of their numbers: by their distance from the origin.
+
+    Those that are as far count by their places in the file, which no choice of axes changes.
+    """
+    keys = [
+        (float(np.linalg.norm(opening.centre)), *wall.to_file(opening.centre[None])[0] * wall.scale)
+        for opening in openings
+    ]
+
+    def compare(i: int, j: int) -> int:
+        for a, b in zip(keys[i], keys[j], strict=True):
+            if abs(a - b) > SAME_PLACE * radius:
+                return -1 if a < b else 1
+        return 0
+
+    return [openings[i] for i in sorted(range(len(openings)), key=cmp_to_key(compare))]
 
 
 def _is_tube_in(lumen: Lumen, larger: list[Lumen]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -168,13 +169,45 @@ def test_ducts_of_four_triangles_a_side_are_centred(width: float, height: float)
 def test_narrow_and_wide_places_are_passed_in_the_middle() -> None:
     """A cone, a narrowing to a third, a chamber four times as wide: the path stays on the axis."""
     s = STRAIGHT[:, 0]
-    for radii, bar in (
-        (np.linspace(0.5, 1.5, 81), BAR),
-        (1.0 - 0.65 * np.exp(-(((s - 10.0) / 1.5) ** 2)), BAR),
-        (1.0 + 3.0 * np.exp(-(((s - 10.0) / 2.0) ** 2)), 0.25),
+    for radii in (
+        np.linspace(0.5, 1.5, 81),
+        1.0 - 0.65 * np.exp(-(((s - 10.0) / 1.5) ** 2)),
+        1.0 + 3.0 * np.exp(-(((s - 10.0) / 2.0) ** 2)),
     ):
         found = find_centreline(wall_of(extrude(STRAIGHT, [circle(24, r) for r in radii])))
-        assert deviation(found.points, STRAIGHT, 1.0) < bar
+        assert deviation(found.points, STRAIGHT, 1.0) < BAR
+
+
+def test_section_of_a_star_is_one_tube() -> None:
+    """Corners that see the middle of no other: one tube with two openings, on its axis."""
+    angle = 2.0 * np.pi * np.arange(10) / 10
+    spikes = np.where(np.arange(10) % 2, 0.5, 1.4)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    found = find_centreline(wall_of(extrude(s_bend(31), spikes)))
+    assert deviation(found.points, s_bend(), 0.8) < BAR
+    assert len(found.openings) == 2
+
+
+def test_section_of_an_l_is_one_tube() -> None:
+    """Two legs with a corner between them: one tube, from mouth to mouth."""
+    corners = np.array([[-1, -1], [3, -1], [3, 1], [1, 1], [1, 3], [-1, 3]], dtype=float)
+    found = find_centreline(wall_of(extrude(STRAIGHT[[0, -1]], corners)))
+    assert sorted(found.points[[0, -1], 0]) == pytest.approx([0.0, 20.0], abs=0.1)
+
+
+@pytest.mark.parametrize("kind", ["holes", "joints"])
+def test_gaps_in_the_wall_are_noted_and_flown(kind: str) -> None:
+    """A scan with holes, a pipe of segments that do not quite meet: the axis of the whole one, and a note."""
+    vertices, faces = extrude(STRAIGHT, circle(32))
+    middle = vertices[faces].mean(axis=1)
+    if kind == "holes":
+        centres = np.random.default_rng(3).choice(middle, 20)
+        kept = np.linalg.norm(middle[:, None] - centres, axis=2).min(axis=1) > 0.3
+    else:
+        kept = np.abs((middle[:, 0] % 5.0) - 2.5) < 2.3
+    found = find_centreline(wall_of((vertices, faces[kept])))
+    assert deviation(found.points, STRAIGHT, 1.0) < BAR
+    assert (found.used, len(found.openings)) == ((1, 2), 2)
+    assert any("do not meet" in note if kind == "joints" else "hole" in note for note in found.notes)
 
 
 # ---------------------------------------------------------------- ends
@@ -218,13 +251,17 @@ def test_named_ends_are_joined_through_a_junction(ends: Any, length: float) -> N
 
 
 def test_ends_are_named_by_the_numbers_of_openings() -> None:
-    """Opening 1 is the one nearest to the origin; from 3 to 1 is the way from the first to the last of them."""
-    wall = wall_of(junction([-12, 0, 0], [6, 5, 0], [6, -5, 1]))
+    """Opening 1 is the one nearest to the origin, of two as far the one further back in x, then y, then z of the
+    file, whatever its axes; from 3 to 1 is the way from the first to the last of them."""
+    ends = np.array([[6, -5, 1], [6, 5, 0], [-12, 0, 0]], dtype=float)
+    wall = wall_of(junction(*ends))
     found = find_centreline(wall, 3, 1)
     assert found.used == (3, 1)
-    distances = [float(np.linalg.norm(opening.centre)) for opening in found.openings]
-    assert distances == sorted(distances)
-    assert np.linalg.norm(found.points[0] - [-12, 0, 0]) < 0.3
+    assert np.linalg.norm(found.points[0] - ends[2]) < 0.3
+    turned = replace(wall, vertices=wall.vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0], axes="yup")
+    for openings, places in ((found.openings, wall), (find_centreline(turned, 1, 2).openings, turned)):
+        centres = places.to_file(np.array([opening.centre for opening in openings]))
+        assert np.linalg.norm(centres - ends, axis=1).max() < 0.3
     with pytest.raises(CentrelineError, match="expected the number of one of 3 openings"):
         find_centreline(wall, 4, 1)
 
@@ -264,13 +301,13 @@ def test_a_start_inside_begins_there_and_an_end_alone_is_enough() -> None:
 # ---------------------------------------------------------------- which space
 
 
-@pytest.mark.parametrize("around", ["wider tube", "room"])
+@pytest.mark.parametrize("around", ["wider tube", "hall", "room"])
 def test_inner_tube_is_flown_and_not_what_is_around_it(around: str) -> None:
-    """A tube in a tube, and in a closed room sixty radii wide: the tube that is behind most walls."""
-    box = trimesh.creation.box((60, 60, 60))
+    """A tube in a tube, in a closed hall sixty radii wide, or in a low room: the tube that is behind most walls."""
     other = {
         "wider tube": extrude(STRAIGHT, circle(24, 2.2)),
-        "room": (np.asarray(box.vertices, dtype=float), np.asarray(box.faces, dtype=np.int64)),
+        "hall": box(60.0, 60.0, 60.0),
+        "room": box(60.0, 30.0, 20.0),
     }[around]
     found = find_centreline(wall_of(join(extrude(STRAIGHT, circle()), other)))
     assert deviation(found.points, STRAIGHT, 1.0) < BAR
@@ -316,13 +353,22 @@ def crossing() -> Mesh:
     return extrude(4.0 * np.stack([t**3 - 3.0 * t, 1.5 * t**2, 0.0 * t], axis=1), circle())
 
 
-def solid(name: str) -> Mesh:
-    """A closed body that is no tube."""
-    body: Any = {
-        "sphere": partial(trimesh.creation.icosphere, subdivisions=3),
-        "cube": partial(trimesh.creation.box, (2, 2, 2)),
-    }[name]()
+def ball() -> Mesh:
+    """A sphere."""
+    body = trimesh.creation.icosphere(subdivisions=3)
     return np.asarray(body.vertices, dtype=float), np.asarray(body.faces, dtype=np.int64)
+
+
+def box(*extents: float) -> Mesh:
+    """A closed box about the origin."""
+    body = trimesh.creation.box(extents)
+    return np.asarray(body.vertices, dtype=float), np.asarray(body.faces, dtype=np.int64)
+
+
+def bowl() -> Mesh:
+    """Half of a sphere."""
+    vertices, faces = ball()
+    return vertices, faces[vertices[faces].mean(axis=1)[:, 2] < 0.0]
 
 
 def plane() -> Mesh:
@@ -336,12 +382,18 @@ def plane() -> Mesh:
         (plane, "no two walls that face each other: an open surface"),
         (partial(channel, 180.0), "an open surface|as in a half-pipe"),
         (partial(channel, 90.0), r"open along its side from \(.*\) to \(.*\), as a half-pipe is"),
-        (partial(solid, "sphere"), "no longer than wide"),
-        (partial(solid, "cube"), "no longer than wide"),
+        (ball, "no longer than wide"),
+        (partial(box, 2.0, 2.0, 2.0), "no longer than wide"),
         (partial(pinched, 0.0), r"blocked or pinched near \((9\.|10)"),
         (partial(pinched, 0.08), r"pinched (near|at) \((9\.|10)"),
         (lambda: extrude(trefoil(), circle(16, 0.8), closed=True), "a closed loop through"),
         (crossing, "blocked or pinched near"),
+        (lambda: box(20.0, 20.0, 2.0), r"wide or flat space without openings around \(-?0\."),
+        (bowl, "no longer than wide"),
+        (
+            lambda: join(extrude(STRAIGHT, circle()), extrude(STRAIGHT + np.array([21.5, 0.0, 0.0]), circle())),
+            r"parts of it that do not meet near \(20\.",
+        ),
         (
             lambda: join(extrude(STRAIGHT, circle()), extrude(STRAIGHT + np.array([0.0, 5.0, 0.0]), circle())),
             r"another of its size beside it, nearest at \(.*2\.[45]",
@@ -349,13 +401,23 @@ def plane() -> Mesh:
     ],
     ids=[
         "plane", "half-pipe", "channel", "sphere", "cube", "pinched shut", "pinched", "closed knot",
-        "self-crossing", "two tubes",
+        "self-crossing", "flat box", "bowl", "tubes in a row", "two tubes",
     ],
 )  # fmt: skip
 def test_what_cannot_be_flown_is_refused_with_reason_and_place(make: Callable[[], Mesh], why: str) -> None:
     """No enclosure, no length, no free way, no ends, no single tube: each has its own sentence."""
     with pytest.raises(CentrelineError, match=why):
         find_centreline(wall_of(make()))
+
+
+def test_what_stands_in_the_middle_is_passed() -> None:
+    """A plate across the lower half of a tube: over it, with room, and along the axis elsewhere."""
+    plate = np.array([[10, -1, -1], [10, 1, -1], [10, 1, 0], [10, -1, 0]], dtype=float), plane()[1]
+    mesh = join(extrude(STRAIGHT, circle()), plate)
+    found = find_centreline(wall_of(mesh))
+    over = found.points[np.argmin(np.abs(found.points[:, 0] - 10.0))]
+    assert over[2] > 0.25
+    assert np.abs(found.points[np.abs(found.points[:, 0] - 10.0) > 3.0][:, 1:]).max() < BAR
 
 
 def test_narrow_slit_is_noted_and_flown() -> None:
