@@ -10,10 +10,10 @@ Quantity = Literal["clearance", "reward", "speed"]
 # The colours of the centreline and of the camera's field are in neither of the first two maps.
 _SCALES: Final[dict[Quantity, tuple[str, str]]] = {
     "clearance": ("gap to wall\n(m)", "RdBu"),
-    "reward": ("reward\nper step", "RdBu"),
+    "reward": ("reward, 96 %\nof steps", "RdBu"),
     "speed": ("speed\n(m/s)", "viridis"),
 }
-"""Title and map of matplotlib's. The gap is that between body and wall."""
+"""Title and map of matplotlib's. The gap is that between body and wall; rewards beyond its ends have their colours."""
 
 
 @dataclass(frozen=True)

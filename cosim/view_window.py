@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from cosim.vedo_scene import Stage
 
 NAP_S: Final = 0.01
-KEYS: Final = "space play   \u2190 \u2192 step   Home End   c camera   q quit"
+KEYS: Final = "space play   \u2190 \u2192 step   Home End   drag turn   wheel zoom   c camera   q quit"
 QUIT: Final = ("q", "Escape")
 _PLAY, _PAUSE = 0, 1
 
