@@ -30,6 +30,9 @@ class _Commands(click.Group):
 
     def make_context(self, *arguments: Any, **named: Any) -> click.Context:
         """Parse what precedes a command; --help and --version write here."""
+        # None leaves colours to whether a stream is a terminal.
+        plain = bool(os.environ.get("NO_COLOR")) or os.environ.get("TERM") == "dumb"
+        named.setdefault("color", False if plain else None)
         with _unread_output():
             return super().make_context(*arguments, **named)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pty
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 from click.shell_completion import ShellComplete
 from click.testing import CliRunner
-from flights import DEADLINE, command, environment, run_cosim, run_here
+from flights import DEADLINE, ROOT, command, environment, run_cosim, run_here
 
 from cosim import __version__
 from cosim.cli import cosim
@@ -99,6 +100,24 @@ def test_a_file_is_refused_before_the_work(arguments: tuple[str, ...], tmp_path:
     assert (done.status, "expected a folder" in done.stderr) == (2, True)
     done = run_here(*arguments, option, str(tmp_path))
     assert (done.status, "is a directory" in done.stderr) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("variables", "coloured"), [({}, True), ({"NO_COLOR": "1"}, False), ({"TERM": "dumb"}, False)]
+)
+def test_colours_can_be_refused(variables: dict[str, str], coloured: bool) -> None:
+    """On a terminal there are some, but for NO_COLOR and for a terminal that has none."""
+    ours, theirs = pty.openpty()
+    done = subprocess.run(
+        command("doctor"), check=False, stdout=theirs, cwd=ROOT, timeout=DEADLINE,
+        env=environment() | {"TERM": "xterm", "NO_COLOR": ""} | variables,
+    )  # fmt: skip
+    os.close(theirs)
+    with os.fdopen(ours, "rb") as terminal:
+        said = terminal.read1()
+    assert done.returncode in (0, 1)
+    assert b"python" in said
+    assert (b"\x1b" in said) == coloured
 
 
 def test_the_version_is_told() -> None:
