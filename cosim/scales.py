@@ -13,7 +13,7 @@ _SCALES: Final[dict[Quantity, tuple[str, str]]] = {
     "reward": ("reward, 96 %\nof steps", "RdBu"),
     "speed": ("speed\n(m/s)", "viridis"),
 }
-"""Title and map of matplotlib's. The gap is that between body and wall; rewards beyond its ends have their colours."""
+"""Title and map of matplotlib's. The gap is that between body and wall; rewards beyond the ends look like them."""
 
 
 @dataclass(frozen=True)
