@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -120,15 +121,20 @@ def _damage(run: Run, index: int, record: bytes, check: int) -> Finding:
 
 def _flipped_bit(record: bytes, check: int) -> tuple[int, int] | None:
     """Byte and bit whose flipping gives a record its check sum; None where no single one does."""
-    raw = bytearray(record)
-    for byte in range(len(raw)):
+    return _bits_by_effect(len(record)).get(zlib.crc32(record) ^ check)
+
+
+@cache
+def _bits_by_effect(size: int) -> dict[int, tuple[int, int]]:
+    """Every bit of a record of `size` bytes by what its flipping does to the CRC-32, whatever else stands there."""
+    raw = bytearray(size)
+    nothing, bits = zlib.crc32(raw), {}
+    for byte in range(size):
         for bit in range(8):
-            raw[byte] ^= 1 << bit
-            found = zlib.crc32(raw)
-            raw[byte] ^= 1 << bit
-            if found == check:
-                return byte, bit
-    return None
+            raw[byte] = 1 << bit
+            bits[zlib.crc32(raw) ^ nothing] = byte, bit
+        raw[byte] = 0
+    return bits
 
 
 def _value(record: bytes, column: Column, element: int) -> str:
