@@ -7,6 +7,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -47,10 +48,9 @@ def bench(*, as_json: bool, quick: bool, training: bool = False, runs: bool = Fa
 
     say("round trips ...")
     figures: dict[str, Any] = {"round_trip": measure(samples, repeats)}
-    say("control loop ...")
     # A flight takes a tenth of a second, in which a shared machine may run at any speed: many, in turn.
     flights = 1 if quick else 15
-    figures |= measure_loop(flights)
+    figures |= measure_loop(flights, say)
     if as_json:
         click.echo(json.dumps(figures))
     else:
@@ -74,14 +74,20 @@ def bench_runs(*, as_json: bool, quick: bool) -> None:
     click.echo(json.dumps({"runs": figures}) if as_json else runs_table(figures))
 
 
-def measure_loop(repeats: int) -> dict[str, Any]:
-    """Fly the shipped conduit and, in turn, run the bare loop over the same states; medians over the repeats."""
+def measure_loop(repeats: int, say: Callable[[str], None]) -> dict[str, Any]:
+    """Fly the shipped conduit and, in turn, run the bare loop over the same states; medians over the repeats.
+
+    Args:
+        repeats: flights.
+        say: is told which of them is next.
+    """
     tube = read_tube(INDUSTRIAL)
     settings = Settings()
     rows: list[dict[str, float]] = []
     limits: list[dict[str, float]] = []
     startups: list[float] = []
     for seed in range(repeats):
+        say(f"control loop, {seed + 1} of {repeats} ...")
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "run"
             report = _launch("--seed", str(seed), "--out", str(out))

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from cosim import __version__
 from cosim.errors import OutputError, RunError
 from cosim.folders import RESULTS
+from cosim.live import working
 from cosim.recording import LOG, MANIFEST
 from cosim.report_axis import whole_axis
 from cosim.report_evaluation import describe_evaluation, read_results
@@ -109,7 +110,8 @@ def report(sources: Sequence[Path], out: Path | None = None, fly: int = 0) -> Pa
     if target.name in (MANIFEST, LOG, RESULTS):
         raise OutputError(f"{target}: expected the name of a page, found that of the data")
     arrays = Arrays()
-    described, tubes = _describe(runs, arrays)
+    with working(f"building {target.name}"):
+        described, tubes = _describe(runs, arrays)
     evaluations = [describe_evaluation(path, found, runs) for path, found in results.items()]
     data = {
         "made": {"cosim": __version__, "at": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())},
