@@ -54,39 +54,19 @@ def describe(
     and in the coordinates of the mesh's file (`file`); `clearance_m` is what is free beside the drone. Numbers of
     openings count from 1. `profile` holds one value for each section, null where there is none.
     """
-    wall, found = tube.wall, tube.found
-    wall_distance = float(profile.clearance[profile.narrowest])
+    wall = tube.wall
     return {
         "mesh": str(tube.path),
         "sha256": tube.sha256,
+        "companions": dict(wall.companions),
         "flyable": refused is None,
         "refused": refused,
         "axes": tube.axes,
         "scale": tube.scale,
         "stated": wall.stated.where,
         "unit": {"metres": guess.metres, "reason": guess.reason, "advice": guess.advice},
-        "walls": {
-            "vertices": construction.vertices,
-            "faces": construction.faces,
-            "duplicate_faces": construction.duplicate_faces,
-            "double": construction.thickness is not None,
-            "thickness_m": construction.thickness,
-            "normals": construction.normals,
-            "flipped_share": construction.flipped,
-            "holes": construction.holes,
-        },
-        "centreline": {
-            "found": found is not None,
-            "method": None if found is None else METHOD,
-            "path": None if tube.centreline_path is None else str(tube.centreline_path),
-            "sha256": tube.centreline_sha256,
-            "length_m": tube.length,
-            "start": _place(wall, tube.axis[0]),
-            "end": _place(wall, tube.axis[-1]),
-            "openings": _ends(tube, construction) if found is None else list(found.used),
-            "capped": list(construction.capped),
-            "notes": [] if found is None else list(found.notes),
-        },
+        "walls": _walls(construction),
+        "centreline": _centreline(tube, construction),
         "openings": [describe_opening(wall, opening) for opening in construction.openings],
         "radius": {
             "mean_m": float(profile.radius.mean()),
@@ -97,37 +77,81 @@ def describe(
             "shape": profile.shape,
             "harmonics": [float(a) for a in np.median(profile.harmonics, axis=0)],
         },
-        "narrowest": {
-            "arc_length_m": float(profile.arc_length[profile.narrowest]),
-            "place": _place(wall, profile.points[profile.narrowest]),
-            "wall_distance_m": wall_distance,
-            "body_radius_m": body_radius,
-            "clearance_m": wall_distance - body_radius,
-        },
-        "tightest": {
-            "arc_length_m": float(profile.arc_length[profile.tightest]),
-            "place": _place(wall, profile.points[profile.tightest]),
-            "curvature_per_m": float(profile.curvature[profile.tightest]),
-            "curvature_times_radius": float(profile.bend[profile.tightest]),
-        },
+        "narrowest": _narrowest(wall, profile, body_radius),
+        "tightest": _tightest(wall, profile),
         "engine_agreement": {
             "rays": agreement.rays,
             "median_m": agreement.median,
             "largest_m": agreement.largest,
             "share_apart": agreement.apart,
         },
-        "profile": {
-            "arc_length_m": _numbers(profile.arc_length),
-            "radius_m": _numbers(profile.radius),
-            "least_m": _numbers(profile.least),
-            "greatest_m": _numbers(profile.greatest),
-            "clearance_m": _numbers(profile.clearance - body_radius),
-            "curvature_per_m": _numbers(profile.curvature),
-            "torsion_per_m": _numbers(profile.torsion),
-            "ellipticity": _numbers(profile.harmonics[:, 1]),
-            "lobes": _numbers(profile.harmonics[:, 2:].max(axis=1)),
-            "open_share": _numbers(profile.opened),
-        },
+        "profile": _profile(profile, body_radius),
+    }
+
+
+def _walls(construction: Construction) -> dict[str, Any]:
+    return {
+        "vertices": construction.vertices,
+        "faces": construction.faces,
+        "duplicate_faces": construction.duplicate_faces,
+        "double": construction.thickness is not None,
+        "thickness_m": construction.thickness,
+        "normals": construction.normals,
+        "flipped_share": construction.flipped,
+        "holes": construction.holes,
+    }
+
+
+def _centreline(tube: Tube, construction: Construction) -> dict[str, Any]:
+    wall, found = tube.wall, tube.found
+    return {
+        "found": found is not None,
+        "method": None if found is None else METHOD,
+        "path": None if tube.centreline_path is None else str(tube.centreline_path),
+        "sha256": tube.centreline_sha256,
+        "length_m": tube.length,
+        "start": _place(wall, tube.axis[0]),
+        "end": _place(wall, tube.axis[-1]),
+        "openings": _ends(tube, construction) if found is None else list(found.used),
+        "capped": list(construction.capped),
+        "notes": [] if found is None else list(found.notes),
+    }
+
+
+def _narrowest(wall: Wall, profile: Profile, body_radius: float) -> dict[str, Any]:
+    at = profile.narrowest
+    wall_distance = float(profile.clearance[at])
+    return {
+        "arc_length_m": float(profile.arc_length[at]),
+        "place": _place(wall, profile.points[at]),
+        "wall_distance_m": wall_distance,
+        "body_radius_m": body_radius,
+        "clearance_m": wall_distance - body_radius,
+    }
+
+
+def _tightest(wall: Wall, profile: Profile) -> dict[str, Any]:
+    at = profile.tightest
+    return {
+        "arc_length_m": float(profile.arc_length[at]),
+        "place": _place(wall, profile.points[at]),
+        "curvature_per_m": float(profile.curvature[at]),
+        "curvature_times_radius": float(profile.bend[at]),
+    }
+
+
+def _profile(profile: Profile, body_radius: float) -> dict[str, list[float | None]]:
+    return {
+        "arc_length_m": _numbers(profile.arc_length),
+        "radius_m": _numbers(profile.radius),
+        "least_m": _numbers(profile.least),
+        "greatest_m": _numbers(profile.greatest),
+        "clearance_m": _numbers(profile.clearance - body_radius),
+        "curvature_per_m": _numbers(profile.curvature),
+        "torsion_per_m": _numbers(profile.torsion),
+        "ellipticity": _numbers(profile.harmonics[:, 1]),
+        "lobes": _numbers(profile.harmonics[:, 2:].max(axis=1)),
+        "open_share": _numbers(profile.opened),
     }
 
 
