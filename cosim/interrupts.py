@@ -48,6 +48,9 @@ def ignore() -> None:
     """Ignore the signals from here on: the command has ended, and only the interpreter has not."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
+    # Where Ctrl-C broke off code that was given as a string, as dataclasses make theirs at an import, `python -m`
+    # would kill itself by SIGINT at its exit, whatever the status. The next such code that ends makes it forget.
+    exec("")
 
 
 def pending() -> signal.Signals | None:

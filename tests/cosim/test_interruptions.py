@@ -142,6 +142,22 @@ def test_ctrl_c_is_neither_lost_nor_cuts_cleaning_short(code: str, said: str, to
     assert (done.status, done.stdout, done.stderr) == (0, said, told)
 
 
+def test_ctrl_c_in_code_that_a_library_makes_leaves_the_exit_status_alone(tmp_path: Path) -> None:
+    """Dataclasses run strings at an import; `python -m` would end by SIGINT in place of the status it was given."""
+    made = "try:\n    exec('press()')\nexcept KeyboardInterrupt:\n    interrupts.ignore()\n"
+    (tmp_path / "made.py").write_text(f"{LISTENING}{made}raise SystemExit(130)\n")
+    done = subprocess.run(
+        [sys.executable, "-m", "made"],
+        check=False,
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=environment(),
+        timeout=DEADLINE,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
 def test_ctrl_c_at_any_moment_of_the_start_leaves_nothing(session_name: str, tmp_path: Path) -> None:
     """Between the first import and the first step: status 130, no traceback, no process, no segment, no folder.
 
