@@ -30,6 +30,8 @@ class _Came:
 
     number: signal.Signals | None = None
     again: bool = False
+    terminals: tuple[int, ...] = ()
+    """Those of stdout and stderr that were a terminal at the beginning."""
 
 
 _came = _Came()
@@ -41,6 +43,7 @@ def listen() -> None:
         if number is not signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _take)
     signal.signal(signal.SIGALRM, _raise_again)
+    _came.terminals = tuple(stream for stream in (1, 2) if os.isatty(stream))
     sys.unraisablehook = _notice_swallowed
 
 
@@ -81,7 +84,18 @@ def _take(number: int, frame: FrameType | None) -> None:
         return
     if _came.number is None:
         _came.number = signal.Signals(number)
+    if number == signal.SIGHUP:
+        _leave_terminal()
     check()
+
+
+def _leave_terminal() -> None:
+    """Write to nowhere what went to a terminal that is gone: its errors would come between us and the cleaning."""
+    for stream in _came.terminals:
+        if not os.isatty(stream):
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, stream)
+            os.close(null)
 
 
 def _is_ending() -> bool:
