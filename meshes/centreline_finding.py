@@ -30,7 +30,6 @@ from meshes.lumen import Balls, draw_balls, look_around, shortest_way, sphere
 from meshes.openings import Opening
 from meshes.sections import measure_rings, resample_evenly
 from meshes.swept import unit_tangents
-from meshes.tube import WIDEST_JOINT
 from meshes.tube_ends import NEAR, Place, choose_ends, choose_lumen, refuse_more_tubes
 from meshes.wall import Wall, in_units, place
 
@@ -51,6 +50,8 @@ MOST_OPEN: Final = 1.0 / 6.0
 LONGEST_OPEN: Final = 2.0
 BARE: Final = 0.5
 """Fraction of a section from which on it has no wall: there the parts of a tube do not meet."""
+WIDEST_JOINT: Final = 0.5
+"""Parts of a tube that are so many radii apart are none: drones leave between them."""
 LEAST_AT_ENDS: Final = 0.55
 """Fraction of a section at an end that must have a wall."""
 BARE_ENDS: Final = 0.2
@@ -99,12 +100,16 @@ def find_centreline(wall: Wall, entry: Place | None = None, exit: Place | None =
     if entry is None or exit is None:
         refuse_more_tubes(wall, lumen, others, openings, holes)
     ends = choose_ends(wall, lumen, openings, entry, exit)
-    way = shortest_way(lumen, *ends)
-    points, capped = _centre(wall, lumen.balls.take(way), openings, (entry, exit))
+    way = lumen.balls.take(shortest_way(lumen, *ends))
+    middle, capped = _centre(wall, way, openings, (entry, exit))
+    points = _past_obstacles(wall, middle, way)
     dense, distances = _clearances(wall, points)
     radius = float(np.median(distances))
     notes = _open_places(wall, points, radius) + _notes(wall, openings, holes, capped)
     _refuse_pinched(wall, dense, distances)
+    if points is not middle:
+        at = place(wall, dense[int(np.argmin(distances))])
+        notes += (f"something stands in the tube near {at}: the centreline leaves the middle to pass it",)
     used = _used(openings, points, radius, capped)
     return FoundCentreline(points, radius, tuple(openings), used, capped, notes)
 
@@ -134,7 +139,7 @@ def _centre(
                 longer, capped[end] = points, False
         points = longer[::-1]
     points = resample_evenly(_within_walls(wall, points), EVEN_STEP * float(np.quantile(way.radii, 0.2)))
-    return _past_obstacles(wall, points, way), (capped[0], capped[1])
+    return points, (capped[0], capped[1])
 
 
 def _within_walls(wall: Wall, points: Floats) -> Floats:
@@ -222,10 +227,11 @@ def _open_places(wall: Wall, points: Floats, radius: float) -> tuple[str, ...]:
         return (f"the wall is open to the side {where}",)
     first, stop = _longest(bare, along)
     at = place(wall, points[(first + stop - 1) // 2])
-    if along[stop - 1] - along[first] > WIDEST_JOINT * radius:
+    gap = float(along[stop - 1] - along[first] + along[1])
+    if gap > WIDEST_JOINT * radius:
         raise CentrelineError(
             f"{wall.path}: expected one tube, found parts of it that do not meet near {at}, where nothing is around "
-            f"for {in_units(wall, float(along[stop - 1] - along[first]))}; close the gap"
+            f"for {in_units(wall, gap)}; close the gap, or name an entry and an exit in one of them (--entry, --exit)"
         )
     joints = int((np.diff(bare.astype(np.int8)) > 0).sum())
     others = f", and in {joints - 1} other places" if joints > 1 else ""
