@@ -90,7 +90,11 @@ def choose_pilot(name: str, lookahead: float | None = None, speed: float | None 
                 raise CosimError(f"{option}: only --policy {PURE_PURSUIT} has one")
     if name in (PURE_PURSUIT, TUNED_PURSUIT, LIDAR_RULE):
         return PilotChoice(name, None, lookahead, speed)
-    path = existing_file("policy", name, SHIPPED_POLICY, SHIPPED_CHECKPOINT)
+    try:
+        path = existing_file("policy", name, SHIPPED_POLICY, SHIPPED_CHECKPOINT)
+    except CosimError as error:
+        known = ", ".join((SHIPPED_POLICY, PURE_PURSUIT, LIDAR_RULE))
+        raise CosimError(f"{error}; without a file there are {known}") from error
     return PilotChoice(name, path)
 
 
