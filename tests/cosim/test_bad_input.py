@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from flights import DEADLINE, Done, command, environment, run_cosim
+from flights import DEADLINE, Done, command, environment, run_cosim, run_here
 
 SQUARE_TUBE = """v 0 1 1\nv 0 -1 1\nv 0 -1 -1\nv 0 1 -1\nv 9 1 1\nv 9 -1 1\nv 9 -1 -1\nv 9 1 -1
 f 1 2 6 5\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8\n"""
@@ -148,17 +148,22 @@ def test_bad_input_leaves_no_folder_behind(tmp_path: Path) -> None:
         assert sorted(tmp_path.rglob("*")) == before
 
 
+def launch_here(folder: Path, *arguments: str) -> Done:
+    """`cosim launch` in this process, for what is refused before another one is started."""
+    return run_here("launch", "--json", "--out", str(folder / "run"), *arguments)
+
+
 def test_values_out_of_range(fly: Callable[..., Done], tmp_path: Path) -> None:
     """Options with impossible values are refused before anything is started."""
-    refused(fly("--scale", "-1"), tmp_path, "--scale")
-    refused(fly("--parameter", "mess=1"), tmp_path, "mess", "mass")
-    refused(fly("--parameter", "mass=heavy"), tmp_path, "mass", "heavy")
-    refused(fly("--parameter", "mass=-1"), tmp_path, "mass", "> 0")
-    refused(fly("--parameter", "restitution=2"), tmp_path, "restitution", "0 to 1")
-    refused(fly("--compensation", "3"), tmp_path, "compensation")
-    refused(fly("--seed", str(2**64)), tmp_path, "--seed")
-    refused(fly("--server", "'x"), tmp_path, "--server")
-    refused(fly("--connect", "x", "--server", "y"), tmp_path, "--connect")
-    refused(fly("--mesh", str(tmp_path)), tmp_path, "a folder")
+    refused(launch_here(tmp_path, "--scale", "-1"), tmp_path, "--scale")
+    refused(launch_here(tmp_path, "--parameter", "mess=1"), tmp_path, "mess", "mass")
+    refused(launch_here(tmp_path, "--parameter", "mass=heavy"), tmp_path, "mass", "heavy")
+    refused(launch_here(tmp_path, "--parameter", "mass=-1"), tmp_path, "mass", "> 0")
+    refused(launch_here(tmp_path, "--parameter", "restitution=2"), tmp_path, "restitution", "0 to 1")
+    refused(launch_here(tmp_path, "--compensation", "3"), tmp_path, "compensation")
+    refused(launch_here(tmp_path, "--seed", str(2**64)), tmp_path, "--seed")
+    refused(launch_here(tmp_path, "--server", "'x"), tmp_path, "--server")
+    refused(launch_here(tmp_path, "--connect", "x", "--server", "y"), tmp_path, "--connect")
+    refused(launch_here(tmp_path, "--mesh", str(tmp_path)), tmp_path, "a folder")
     refused(fly("--server", "/no/such/program"), tmp_path, "/no/such/program")
     refused(fly("--session", "a/b"), tmp_path, "a/b")

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from flights import DEADLINE, ROOT, command, environment, leftovers, run_cosim
+from flights import DEADLINE, ROOT, command, environment, leftovers, run_cosim, run_here
 
 pytest.importorskip("stable_baselines3", reason="the extra 'train' is not installed")
 
@@ -51,7 +51,7 @@ def wait_for_iterations(process: subprocess.Popen[str], folder: Path, count: int
 def test_a_policy_trained_by_the_command_can_be_flown(tmp_path: Path, session_name: str) -> None:
     """A folder with checkpoint, log, TensorBoard's logs and figures; a line an iteration where no terminal is."""
     out = tmp_path / "out"
-    trained = run_cosim("train", *TINY, "--steps", "1600", "--seed", "7", "--out", str(out), cwd=tmp_path)
+    trained = run_here("train", *TINY, "--steps", "1600", "--seed", "7", "--out", str(out))
     assert trained.status == 0, trained.stderr
     assert trained.stdout.strip() == str(out / "policy.zip")
     assert "training 'quick' to 1,600 steps, seed 7: 4 drones, kinematic dynamics" in trained.stderr
@@ -101,12 +101,12 @@ def test_a_training_survives_kills_and_stops(tmp_path: Path) -> None:
     assert "Traceback" not in said
 
     steps = 800 * (len(read_log(out / "policy.csv")) + 1)
-    ended = run_cosim("train", "--resume", "mine", "--steps", str(steps), cwd=tmp_path)
+    ended = run_here("train", "--resume", str(out), "--steps", str(steps))
     assert ended.status == 0, ended.stderr
     assert [row.steps for row in read_log(out / "policy.csv")] == list(range(800, steps + 1, 800))
     assert load_policy(out / "policy.zip").contract.training["steps"] == steps
     (out / "success.png").unlink()
-    again = run_cosim("train", "--resume", "mine", "--steps", str(steps), cwd=tmp_path)
+    again = run_here("train", "--resume", str(out), "--steps", str(steps))
     assert again.status == 0, again.stderr
     assert "steps are done; for more, add --steps" in again.stderr
     assert (out / "success.png").exists()
@@ -114,8 +114,8 @@ def test_a_training_survives_kills_and_stops(tmp_path: Path) -> None:
 
 def test_the_same_training_is_the_same_file(tmp_path: Path) -> None:
     """Two processes that train alike write the same checkpoint, byte for byte."""
-    for name in ("one", "two"):
-        done = run_cosim("train", *TINY, "--steps", "800", "--out", name, cwd=tmp_path)
+    run = ("train", *TINY, "--steps", "800", "--out")
+    for done in (run_cosim(*run, "one", cwd=tmp_path), run_here(*run, str(tmp_path / "two"))):
         assert done.status == 0, done.stderr
     one, two = ((tmp_path / name / "policy.zip").read_bytes() for name in ("one", "two"))
     assert one == two
@@ -139,11 +139,11 @@ def test_rigid_bodies_are_trained_in_by_either_engine(engine: str, name: str, tm
 
 def test_what_the_paper_leaves_open_is_printed(tmp_path: Path) -> None:
     """`--explain` prints the table and trains nothing; for another preset there is none."""
-    done = run_cosim("train", "--preset", "paper", "--explain", cwd=tmp_path)
+    done = run_here("train", "--preset", "paper", "--explain")
     assert done.status == 0
     assert done.stdout.strip() == (ROOT / "agent_client" / "PAPER.md").read_text().strip()
     assert list(tmp_path.iterdir()) == []
-    other = run_cosim("train", "--preset", "quick", "--explain", cwd=tmp_path)
+    other = run_here("train", "--preset", "quick", "--explain")
     assert other.status == 2
     assert "expected --preset paper, found quick" in other.stderr
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from protocol.conformance.rule import Outcome, Rule
+from protocol.conformance.rule import Level, Outcome, Rule
 from protocol.conformance.run import run_suite, select
 
 _NO_WALLS = "the plant has no walls"
@@ -20,6 +20,16 @@ SKIPPED = {
     "(refusal 10: gust in lane 0: expected 0, since this plant has no gusts, found 3)",
 }
 """The rules that are skipped on such a plant, and why."""
+
+_TRANSPORTED = {"2", "3", "4", "5", "9", "11"}
+"""Sections whose rules see the transport, but for those about death and pauses, which take long."""
+
+
+def transported_rules() -> list[Rule]:
+    """The rules for servers that the transport could touch."""
+    levels = (Level.CORE, Level.ROBUSTNESS, Level.LANES)
+    rules = [rule for rule in select("server", levels) if rule.section in _TRANSPORTED]
+    return rules + select("server", names=["agent-killed", "reset-forgets", "contact-none-promised"])
 
 
 def count_in_words() -> str:

@@ -106,12 +106,18 @@ def open_session(rendezvous: str, lanes: int = 1) -> AgentSession:
     return AgentSession.open(rendezvous, settings, attach_timeout=PATIENCE_S)
 
 
-@pytest.mark.parametrize("transport", ["shm", "file"])
-def test_the_server_passes_the_suite(server: Path, transport: str) -> None:
+def test_the_server_passes_the_suite(server: Path) -> None:
     """Every rule that is not about speed holds, but for those that need walls or gusts; its page says how many."""
     rules = select("server", [Level.CORE, Level.ROBUSTNESS, Level.LANES])
-    assert kit.run(str(server), transport, rules) == ([], kit.SKIPPED)
+    assert kit.run(str(server), "shm", rules) == ([], kit.SKIPPED)
     assert kit.count_in_words() in " ".join((C_FOLDER / "README.md").read_text().split())
+
+
+def test_the_server_keeps_the_rules_over_files(server: Path) -> None:
+    """Every rule that the transport could touch holds over ordinary mapped files too."""
+    failed, skipped = kit.run(str(server), "file", kit.transported_rules())
+    assert failed == []
+    assert skipped.items() <= kit.SKIPPED.items()
 
 
 def test_nonsense_makes_the_server_do_nothing_that_c_leaves_undefined(sanitized: Path) -> None:

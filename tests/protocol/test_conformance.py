@@ -18,6 +18,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from kit import transported_rules
 
 from protocol import conformance
 from protocol.conformance.report import json_report, junit_report, text_report
@@ -35,8 +36,6 @@ NO_WALLS = {
     *("tube-of-each-lane", "refusal-plant"),
 }
 """Rules that need a plant with walls."""
-TRANSPORTED = {"2", "3", "4", "5", "9", "11"}
-"""Sections whose rules see the transport, but for those about death and pauses, which take long."""
 
 
 def run_all(rules: Iterable[Rule], command: str, transport: str) -> list[Result]:
@@ -65,10 +64,7 @@ def test_the_toy_server_keeps_the_rules_of_speed() -> None:
 
 def test_the_toy_server_keeps_the_rules_over_files() -> None:
     """Every rule that the transport could touch holds over ordinary mapped files too."""
-    levels = (Level.CORE, Level.ROBUSTNESS, Level.LANES)
-    rules = [rule for rule in select("server", levels) if rule.section in TRANSPORTED]
-    rules += select("server", names=["agent-killed", "reset-forgets", "contact-none-promised"])
-    assert ended(run_all(rules, TOY, "file"), Outcome.FAILED) == {}
+    assert ended(run_all(transported_rules(), TOY, "file"), Outcome.FAILED) == {}
 
 
 def test_a_server_with_walls_and_gusts_keeps_what_the_toy_cannot_show() -> None:

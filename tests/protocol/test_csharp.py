@@ -74,12 +74,18 @@ def test_the_server_repeats_the_toy_bit_for_bit(serve: Serve, server: Path, rend
     assert process.wait(PATIENCE_S) == 0
 
 
-@pytest.mark.parametrize("transport", ["shm", "file"])
-def test_the_server_passes_the_suite(server: Path, transport: str) -> None:
+def test_the_server_passes_the_suite(server: Path) -> None:
     """Every rule that is not about speed holds, but for those that need walls or gusts; its page says how many."""
-    found = run_rules(server, transport, Level.CORE, Level.ROBUSTNESS, Level.LANES)
+    found = run_rules(server, "shm", Level.CORE, Level.ROBUSTNESS, Level.LANES)
     assert found == ([], kit.SKIPPED)
     assert kit.count_in_words() in " ".join((SOURCES / "README.md").read_text().split())
+
+
+def test_the_server_keeps_the_rules_over_files(server: Path) -> None:
+    """Every rule that the transport could touch holds over ordinary mapped files too."""
+    failed, skipped = kit.run(f"{MONO} {server}", "file", kit.transported_rules())
+    assert failed == []
+    assert skipped.items() <= kit.SKIPPED.items()
 
 
 def test_a_signal_ends_the_server_with_a_farewell(
