@@ -51,8 +51,8 @@ def measure_runs(effort: Effort, say: Callable[[str], None]) -> dict[str, Any]:
 
     Returns:
         steps: control steps of the flight
-        viewer: steps_per_second alone and viewed (medians), ratio (median of neighbours), pictures (of all flights),
-            same_hash: whether all flights had the same; None in place of it, and reason, where nothing can be drawn
+        viewer: steps_per_second_alone and steps_per_second_viewed (medians), ratio (median of neighbours; None where
+            nothing can be drawn), pictures_per_second, same_hash: whether all flights had the same
         verify: loop_s, physics_s (medians), ratio (median), verified
         report: seconds to write it, megabytes
         bars: rows of name, found, bar, reached; none for flights shorter than `BARS_FROM`
@@ -80,10 +80,11 @@ def _viewer(
     """Flights alone and viewed, neighbours in time; behind them the control steps of one."""
     pairs: list[tuple[float, float]] = []
     hashes: set[str] = set()
-    frames = folder / "frames"
-    frames.mkdir()
+    pictures, seconds = 0, 0.0
     for repeat in range(repeats):
         say(f"flights alone and viewed, {repeat + 1} of {repeats} ...")
+        frames = folder / f"frames{repeat}"
+        frames.mkdir()
         flights = [
             _cosim("launch", *tube, "--out", str(folder / f"{name}{repeat}"), *more)
             for name, more in (
@@ -91,15 +92,16 @@ def _viewer(
                 ("viewed", ("--view-frames", str(frames), "--realtime", MAX_PACE)),
             )
         ]
+        pictures += sum(1 for _ in frames.iterdir())
+        seconds += flights[1]["wall_time_s"]
         hashes |= {flight["trajectory_hash"] for flight in flights}
         pairs.append((flights[0]["steps_per_second"], flights[1]["steps_per_second"]))
-    pictures = sum(1 for _ in frames.iterdir())
     alone, viewed = (statistics.median(values) for values in zip(*pairs, strict=True))
     found = {
         "steps_per_second_alone": round(alone, 1),
         "steps_per_second_viewed": round(viewed, 1),
         "ratio": round(statistics.median(pair[1] / pair[0] for pair in pairs), 3) if pictures else None,
-        "pictures": pictures,
+        "pictures_per_second": round(pictures / seconds, 1),
         "same_hash": len(hashes) == 1,
     }
     return found, flights[0]["steps"]
@@ -167,7 +169,7 @@ def runs_table(figures: dict[str, Any]) -> str:
         same = "the same" if viewer["same_hash"] else "NOT the same"
         lines.append(
             f"  viewed       {viewer['steps_per_second_viewed']:10.0f} steps/s, {viewer['ratio']:.2f} of it; "
-            f"{viewer['pictures']} pictures; {same} trajectory"
+            f"{viewer['pictures_per_second']:.1f} pictures/s; {same} trajectory"
         )
     lines += [
         f"  verify       {verify['loop_s']:10.2f} s in its step loop, {verify['ratio']:.2f} times the run's physics",

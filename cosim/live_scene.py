@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-SIZE: Final = (960, 600)
+SIZE: Final = (800, 500)
+"""Of the window at first (pixels). Without a graphics card a picture takes its time by the pixel: 20 ms here."""
 FRAME_SIZE: Final = (480, 320)
 COMMAND_COLOUR: Final = "#d81b8c"
 KEY: Final = (

@@ -35,8 +35,8 @@ LINGER_S: Final = 2.0
 """How long the window stays when the session has ended (s)."""
 STOP_S: Final = 2.0
 """How long the viewer may take to end (s) before it is killed."""
-NICE: Final = 10
-"""A tenth of the weight of the session's processes: pictures are drawn even where these take all cores."""
+NICE: Final = 4
+"""Two fifths of the weight of the session's processes: enough for most pictures where these take all cores."""
 
 _VIEWER: Final = (
     f"import sys; sys.path.append({str(Path(protocol.__file__).resolve().parents[1])!r}); "

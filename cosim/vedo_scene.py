@@ -76,7 +76,8 @@ class Stage:
         offscreen: draw to pictures, without a window or a display.
         title: of the window.
         sky: colours of the background, bottom and top.
-        smooth: soften edges, which takes time where no graphics card draws.
+        smooth: soften edges and let the sky's colours flow into one another, both of which take time where no
+            graphics card draws.
 
     Raises:
         NoDisplayError: a window is wanted, and there is no display.
@@ -96,7 +97,12 @@ class Stage:
         vedo.settings.multi_samples = 4 if smooth else 0
         self.size = size
         self._plotter = vedo.Plotter(
-            size=size, offscreen=offscreen, title=title, bg=sky[0], bg2=sky[1], interactive=False
+            size=size,
+            offscreen=offscreen,
+            title=title,
+            bg=sky[0],
+            bg2=sky[1] if smooth else None,
+            interactive=False,
         )
         self._unit = _unit(size)
         """Texts grow with the picture."""

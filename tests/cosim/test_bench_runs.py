@@ -21,7 +21,7 @@ def test_what_surrounds_a_flight_is_reported(tmp_path: Path) -> None:
     assert runs["verify"]["verified"] is True
     assert runs["viewer"]["same_hash"] is True
     assert runs["report"]["megabytes"] > 0.5  # the drawing library alone
-    assert (runs["viewer"]["ratio"] is None) == (runs["viewer"]["pictures"] == 0)
+    assert (runs["viewer"]["ratio"] is None) == (runs["viewer"]["pictures_per_second"] == 0)
     assert runs["bars"] == []  # of flights of thousands of steps
     assert list(tmp_path.iterdir()) == []
 
