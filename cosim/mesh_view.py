@@ -117,7 +117,7 @@ def put_up_mesh(stage: Stage, mesh: ViewedMesh, view: View) -> None:
         stage.wall(face_outwards(mesh.surface, mesh.axis), WALL_COLOUR, cut=True)
         stage.lines([mesh.axis], AXIS_COLOUR, 3.0)
         length = float(np.linalg.norm(np.diff(mesh.axis, axis=0), axis=1).sum())
-        size = f"centreline {length:.3g} m   radius {np.median(mesh.radius):.3g} m   {size}"
+        size = f"centreline {length:.3g} m   median radius {np.median(mesh.radius):.3g} m   {size}"
     if mesh.openings:
         stage.lines([_ring(opening) for opening in mesh.openings], OPENING_COLOUR, 3.0)
         stage.numbers([o.centre + 0.3 * o.radius * o.outward for o in mesh.openings], OPENING_COLOUR)

@@ -181,7 +181,8 @@ def _lidar(run: Run, before: np.void, nearest: Floats) -> str:
         least = int(ring.argmin())
         angle = 2.0 * np.pi * least / rays
         where = sides(np.array([0.0, np.sin(angle), np.cos(angle)]))
-        parts.append(f"{name} ring {ring[least]:.2f} m or more, least {where}")
+        which = f"least {where}" if ring.any() else "all round: it had gone through the wall"
+        parts.append(f"{name} ring {ring[least]:.2f} m or more, {which}")
     ahead = float(_local(nearest - before["position"], before)[0])
     text = "; ".join(parts)
     if ahead > 2.0 * offset:
