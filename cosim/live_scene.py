@@ -19,7 +19,7 @@ from cosim.scales import scale_of
 from cosim.scene import Surface
 from cosim.senses import local_frames
 from cosim.view import open_stage
-from cosim.view_window import NAP_S, QUIT
+from cosim.view_window import QUIT
 from meshes.tube import read_tube
 
 if TYPE_CHECKING:
@@ -40,6 +40,8 @@ KEY: Final = (
 )
 """What the colours mean."""
 HELP: Final = "c camera   q close: the flight goes on   way through the poses seen"
+NAP_S: Final = 0.025
+"""Between two looks at the session (s): each takes a core from it for a moment where it has all of them."""
 TRIANGLES: Final = 60_000
 """Of the wall that is drawn at most; rays are computed with all of them."""
 TRAIL_POINTS: Final = 1500

@@ -10,6 +10,7 @@ import itertools
 import os
 import sys
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -35,6 +36,12 @@ LETTER: Final = 0.57
 _OSMESA: Final = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
 
 
+@cache
+def _table(colours: str) -> Floats:
+    """The 256 colours of a scale, each red, green, blue."""
+    return np.array(vedo.color_map(np.arange(256), colours, 0, 255))
+
+
 class Shape:
     """One thing on the stage, which can be moved, painted, and hidden."""
 
@@ -51,7 +58,7 @@ class Shape:
 
     def shade(self, values: Floats, scale: Scale) -> None:
         """Colour its vertices by values (V,)."""
-        table = np.array(vedo.color_map(np.arange(256), scale.colours, 0, 255))
+        table = _table(scale.colours)
         low, high = scale.limits
         share = np.clip((values - low) / (high - low), 0.0, 1.0)
         opaque = np.ones((len(values), 1))
