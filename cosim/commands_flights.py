@@ -61,7 +61,11 @@ def evaluate(as_json: bool, **options: Any) -> None:
 @click.argument("run", type=click.Path(path_type=Path))
 @option("--policy", type=PolicyType(), required=True, metavar="P", help=f"Who flies on: {POLICY_HELP}.")
 @option(
-    "--from-step", type=click.IntRange(min=0), required=True, metavar="K", help="The last step of the run."
+    "--from-step",
+    type=click.IntRange(min=0),
+    required=True,
+    metavar="K",
+    help="Last step of the run that is repeated.",
 )
 @option("--mesh", type=click.Path(path_type=Path), metavar="PATH", help="Where its tube is now.")
 @option("--server", metavar="COMMAND", help="Start your physics as COMMAND RENDEZVOUS.")

@@ -17,6 +17,14 @@ _COUNT: Final = click.IntRange(min=1)
 _SEED: Final = click.IntRange(0, 2**31)
 
 
+_dynamics_option = rare(
+    "--dynamics",
+    type=click.Choice(["kinematic", "rigid-body"]),
+    metavar="WORLD",
+    help="kinematic or rigid-body [default: the preset's].",
+)
+
+
 @command(short_help="Train a policy.")
 @option(
     "--preset",
@@ -33,12 +41,7 @@ _SEED: Final = click.IntRange(0, 2**31)
 )
 @rare("--envs", type=_COUNT, metavar="N", help="Drones side by side [default: the preset's].")
 @rare("--pool", type=_COUNT, metavar="N", help="Tubes a level [default: 1000; fewer with bullet].")
-@rare(
-    "--dynamics",
-    type=click.Choice(["kinematic", "rigid-body"]),
-    metavar="WORLD",
-    help="kinematic or rigid-body [default: the preset's].",
-)
+@_dynamics_option
 @rare(
     "--engine",
     type=click.Choice(["reference", "bullet"]),
@@ -95,12 +98,7 @@ def figures(folder: Path) -> None:
     default="quick",
     help="paper, quick [default] or robust-ppo.",
 )
-@rare(
-    "--dynamics",
-    type=click.Choice(["kinematic", "rigid-body"]),
-    metavar="WORLD",
-    help="kinematic or rigid-body [default: the preset's].",
-)
+@_dynamics_option
 @rare("--hard", is_flag=True, help="Train and fly under the hard conditions.")
 @rare("--unknown-tube", is_flag=True, help="Hide progress and offset from every policy.")
 @option("--steps", type=_COUNT, metavar="N", help="Of a training [default: the preset's].")
